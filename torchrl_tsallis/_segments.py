@@ -1,0 +1,71 @@
+"""Layout of many tensors in one flat vector, with one scalar per tensor or per ensemble member's tensor."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+__all__ = ["Segments"]
+
+
+class Segments:
+    """Flat layout of tensors of one data type and device.
+
+    Each tensor of shape ``[*B, *E]`` gives ``prod(B)`` segments of ``prod(E)`` entries; scalars of all segments are
+    stacked in one vector ``[S]``, so that nothing has to be computed tensor by tensor.
+
+    Args:
+        tensors: the tensors; none of them is kept.
+        batch_dims: number of leading ensemble dimensions, ``len(B)``. Default: 0.
+
+    Raises:
+        ValueError: if a tensor has fewer than ``batch_dims`` dimensions.
+
+    Examples:
+        >>> x = [torch.ones(2, 3), torch.arange(2.0)]
+        >>> segments = Segments(x)
+        >>> segments.mean(segments.flatten(x))
+        tensor([1.0000, 0.5000])
+        >>> segments.expand(torch.tensor([1.0, 2.0]))
+        tensor([1., 1., 1., 1., 1., 1., 2., 2.])
+    """
+
+    def __init__(self, tensors: Sequence[Tensor], batch_dims: int = 0) -> None:
+        for x in tensors:
+            if x.ndim < batch_dims:
+                raise ValueError(
+                    f"a tensor of shape {tuple(x.shape)} has no {batch_dims} leading ensemble dimensions; "
+                    "put it in a group of its own with batch_dims=0"
+                )
+        self.shapes = [x.shape for x in tensors]
+        self.batch_shapes = [x.shape[:batch_dims] for x in tensors]
+        self.sizes = [x.numel() for x in tensors]
+        self.counts = [math.prod(b) for b in self.batch_shapes]
+        self.num_segments = sum(self.counts)
+        lengths = [n // b for n, b in zip(self.sizes, self.counts, strict=True) for _ in range(b)]
+        device = tensors[0].device
+        self.ids = torch.repeat_interleave(torch.tensor(lengths, device=device))
+
+    def flatten(self, tensors: Sequence[Tensor]) -> Tensor:
+        """Copies tensors of the layout's shapes into one vector ``[N]``."""
+        return torch.cat([x.reshape(-1) for x in tensors])
+
+    def views(self, flat: Tensor) -> list[Tensor]:
+        """Views of a vector ``[N]`` in the tensors' shapes ``[*B, *E]``."""
+        return [x.view(s) for x, s in zip(flat.split(self.sizes), self.shapes, strict=True)]
+
+    def scalar_views(self, scalars: Tensor) -> list[Tensor]:
+        """Views of stacked scalars ``[S]``, of shape ``[*B]`` per tensor."""
+        return [x.view(b) for x, b in zip(scalars.split(self.counts), self.batch_shapes, strict=True)]
+
+    def expand(self, scalars: Tensor) -> Tensor:
+        """Repeats stacked scalars ``[S]`` over the entries of their segments, ``[N]``."""
+        return scalars.index_select(0, self.ids)
+
+    def mean(self, flat: Tensor) -> Tensor:
+        """Mean over each segment of a vector ``[N]``, stacked, ``[S]``."""
+        parts = flat.split(self.sizes)
+        return torch.cat([x.view(c, -1).mean(-1) for x, c in zip(parts, self.counts, strict=True)])

@@ -1,0 +1,270 @@
+r"""The method's equations as pure functions of log-densities.
+
+A density is never formed on its own: everything takes and returns logarithms, so that log-densities from -1e4 (an
+action that the imitator rules out) to +60 (a collapsed scale in many dimensions) give finite values and gradients in
+float32. Equation numbers are those of Kobayashi & Aoyama, SII 2025.
+
+===========  ===============  ==========================================================
+symbol       argument         meaning
+===========  ===============  ==========================================================
+ln pi        log_prob         imitator's log-density at the dataset's action, ``[*B]``
+ln pibar     target_log_prob  the target network's, ``[*B]``
+q            q                Tsallis index in [0, 1]; 1 is plain behavioral cloning
+gamma        gamma            relative rating level in [0, 1]; 0 is the absolute rating
+===========  ===============  ==========================================================
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import torch
+from torch import Tensor
+
+#: Exponents are cut here: ``exp(64)`` still sums over 1e10 samples in float32 without overflowing.
+MAX_EXPONENT = 64.0
+_SERIES_TERMS = 20
+
+
+def _like(value: float | Tensor, reference: Tensor) -> Tensor:
+    """``value`` as a tensor of the reference's dtype and device."""
+    if isinstance(value, Tensor):
+        return value.to(reference)
+    return torch.full((), value, dtype=reference.dtype, device=reference.device)
+
+
+def _phi1_derivative(z: Tensor) -> Tensor:
+    """d/dz of (exp(z) - 1) / z, by its series near 0 where the closed form cancels."""
+    near = z.abs() < 1
+    small = torch.where(near, z, 0.0)
+    series = torch.zeros_like(z)
+    for k in range(_SERIES_TERMS, 0, -1):  # sum over k >= 1 of k z^(k-1) / (k+1)!
+        series = series * small + k / math.factorial(k + 1)
+    large = torch.where(near, 1.0, z)
+    return torch.where(near, series, (large * large.exp() - large.expm1()) / large.square())
+
+
+class _LnQ(torch.autograd.Function):
+    """q-logarithm of exp(log_x), with gradients that do not cancel (autograd's own would lose exp(z) << 1)."""
+
+    generate_vmap_rule = True
+
+    @staticmethod
+    def forward(log_x: Tensor, q: Tensor) -> Tensor:
+        u = 1 - q
+        z = (u * log_x).clamp(max=MAX_EXPONENT)
+        return torch.where(u == 0, log_x, z.expm1() / torch.where(u == 0, 1.0, u))
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Tensor, Tensor], output: Tensor) -> None:
+        ctx.save_for_backward(*inputs)
+
+    @staticmethod
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, Tensor | None]:
+        log_x, q = ctx.saved_tensors
+        z = ((1 - q) * log_x).clamp(max=MAX_EXPONENT)
+        by_log_x = grad * z.exp() if ctx.needs_input_grad[0] else None
+        by_q = None
+        if ctx.needs_input_grad[1]:
+            # Past the cut the value is constant in z, so that its slope in u = 1 - q is -expm1(z) / u^2.
+            u = 1 - q
+            cut = u * log_x >= MAX_EXPONENT
+            inside = log_x.square() * _phi1_derivative(torch.where(cut, 0.0, z))
+            outside = -z.expm1() / torch.where(cut, u, 1.0).square()
+            by_q = (-grad * torch.where(cut, outside, inside)).sum_to_size(q.shape)
+        return by_log_x, by_q
+
+
+def ln_q(log_x: Tensor, q: float | Tensor) -> Tensor:
+    r"""The q-logarithm (eq. 3) of a number given by its natural logarithm.
+
+    .. math:: \ln_q x = \frac{x^{1-q} - 1}{1-q}, \qquad \ln_1 x = \ln x
+
+    Args:
+        log_x: natural logarithm of x, ``[*B]``.
+        q: Tsallis index, a number or a tensor that broadcasts against ``log_x``.
+
+    Returns:
+        ``ln_q(x)``, ``[*B]``. The exponent is cut at :data:`MAX_EXPONENT`; the gradient with respect to ``log_x`` is
+        the rating ``x^(1-q)`` of eq. 7.
+
+    Examples:
+        >>> ln_q(torch.tensor([0.0, 2.0]).log(), 0.5)
+        tensor([-2.0000,  0.8284])
+        >>> ln_q(torch.tensor(3.0), 1.0)
+        tensor(3.)
+    """
+    q = _like(q, log_x)
+    # Broadcast outside of the Function: its backward then sees log_x in the output's shape.
+    return _LnQ.apply(log_x.expand(torch.broadcast_shapes(log_x.shape, q.shape)), q)
+
+
+def exp_q(y: Tensor, q: float | Tensor) -> Tensor:
+    r"""The q-exponential, the inverse of :func:`ln_q`: ``exp_q(ln_q(x), q) = x``.
+
+    .. math:: \exp_q(y) = [1 + (1-q) y]_+^{1/(1-q)}, \qquad \exp_1(y) = e^y
+
+    Args:
+        y: argument, ``[*B]``.
+        q: Tsallis index, a number or a tensor that broadcasts against ``y``.
+
+    Returns:
+        ``exp_q(y)``, ``[*B]``; 0 below the cut-off ``y = -1/(1-q)``.
+
+    Examples:
+        >>> exp_q(torch.tensor([-2.0, 0.0, 2.0]), 0.5)
+        tensor([0., 1., 4.])
+    """
+    u = 1 - _like(q, y)
+    plain = u == 0
+    base = u * y
+    alive = base > -1
+    log_x = torch.where(alive, base, 0.0).log1p() / torch.where(plain, 1.0, u)
+    log_x = torch.where(plain, y, log_x).clamp(max=MAX_EXPONENT)
+    return torch.where(plain | alive, log_x.exp(), 0.0)
+
+
+def log_mixture(target_log_prob: Tensor, gamma: float | Tensor) -> Tensor:
+    r"""Logarithm of the paper's reference density (eq. 10).
+
+    .. math:: \ln \pi_\gamma = \ln\{(1-\gamma) + \gamma \bar\pi\}
+
+    Args:
+        target_log_prob: log-density under the target network, ``[*B]``.
+        gamma: relative rating level in [0, 1], a number or a tensor that broadcasts.
+
+    Returns:
+        The log-density of the mixture, ``[*B]``; 0 at ``gamma = 0`` and ``target_log_prob`` at ``gamma = 1``.
+
+    Examples:
+        >>> log_mixture(torch.tensor([-1e4, 0.0]), 0.5)
+        tensor([-0.6931,  0.0000])
+    """
+    gamma = _like(gamma, target_log_prob)
+    inner = (gamma > 0) & (gamma < 1)
+    safe = torch.where(inner, gamma, 0.5)  # keeps log(0) out of the branch that is not taken, and of its gradient
+    mixed = torch.logaddexp(torch.log1p(-safe), safe.log() + target_log_prob)
+    return torch.where(inner, mixed, torch.where(gamma > 0, target_log_prob, torch.zeros_like(mixed)))
+
+
+def rating(log_prob: Tensor, log_reference: float | Tensor, q: float | Tensor) -> Tensor:
+    r"""Implicit weight of a sample (eqs. 7, 9 and 11): its gradient relative to plain BC's.
+
+    .. math:: \rho = (\pi / \pi_\gamma)^{1-q}
+
+    Args:
+        log_prob: imitator's log-density, ``[*B]``.
+        log_reference: log-density of the reference, ``[*B]`` or a number (0 for the absolute rating).
+        q: Tsallis index.
+
+    Returns:
+        The rating, ``[*B]``, in ``[0, exp(64)]``; all ones at ``q = 1``.
+
+    Examples:
+        >>> rating(torch.tensor([-10.0, 0.0]), 0.0, 0.8)
+        tensor([0.1353, 1.0000])
+    """
+    return ((1 - _like(q, log_prob)) * (log_prob - log_reference)).clamp(max=MAX_EXPONENT).exp()
+
+
+def tsallis_nll(log_prob: Tensor, log_reference: float | Tensor, q: float | Tensor) -> Tensor:
+    r"""The loss of every sample (eq. 10), with the reference density held constant.
+
+    .. math:: -\pi_\gamma^{q-1} \ln_q \pi = -\left(\ln_q \frac{\pi}{\pi_\gamma} - \ln_q \frac{1}{\pi_\gamma}\right)
+
+    The right-hand side, by the pseudo-additivity of eq. 5, is what is computed: a large weight and a small
+    ``ln_q`` are never multiplied.
+
+    Args:
+        log_prob: imitator's log-density, ``[*B]``.
+        log_reference: log-density of the reference, ``[*B]`` or a number; no gradient flows into it.
+        q: Tsallis index.
+
+    Returns:
+        The loss, ``[*B]``; its gradient with respect to ``log_prob`` is minus the :func:`rating`. At ``q = 1`` it is
+        the negative log-likelihood, whatever the reference.
+
+    Examples:
+        >>> tsallis_nll(torch.tensor([-3.0, 0.5]), 0.0, 1.0)
+        tensor([ 3.0000, -0.5000])
+    """
+    reference = _like(log_reference, log_prob).detach()
+    return ln_q(-reference, q) - ln_q(log_prob - reference, q)
+
+
+def density_moment(log_prob: Tensor, q: float | Tensor, dim: int = -1) -> Tensor:
+    r"""Batch estimate of :math:`\mathbb{E}[\pi^{1-q}]`, which drives gamma and q (eqs. 12-15).
+
+    Args:
+        log_prob: imitator's log-density, ``[*S, B]``.
+        q: Tsallis index, a number or ``[*S]``.
+        dim: the batch dimension that is averaged over.
+
+    Returns:
+        The mean, ``[*S]``.
+
+    Raises:
+        ValueError: if the batch is empty.
+
+    Examples:
+        >>> density_moment(torch.tensor([0.0, -1e4]), 0.5)
+        tensor(0.5000)
+    """
+    if log_prob.shape[dim] == 0:
+        raise ValueError(
+            f"log_prob of shape {list(log_prob.shape)} has no sample along dim {dim}, so that E[pi^(1-q)] does not "
+            "exist: pass a batch with at least one sample (check that the mask is not False everywhere)"
+        )
+    u = 1 - _like(q, log_prob)
+    if u.ndim:
+        u = u.unsqueeze(dim)
+    return (u * log_prob).clamp(max=MAX_EXPONENT).exp().mean(dim)
+
+
+def adaptive_gamma(moment: Tensor, gamma_min: float = 0.1, gamma_max: float = 0.9) -> Tensor:
+    r"""The relative rating level that fixes the mean bound of the rating at one (eq. 13).
+
+    .. math:: \gamma = \mathrm{clip}(1 - \mathbb{E}[\pi^{1-q}], \underline\gamma, \overline\gamma)
+
+    Args:
+        moment: :math:`\mathbb{E}[\pi^{1-q}]` from :func:`density_moment`, ``[*S]``.
+        gamma_min: lower bound (0.1, section V-B), leaves the relative rating room to act.
+        gamma_max: upper bound (0.9, section V-B), keeps the bound of the rating finite.
+
+    Returns:
+        gamma, ``[*S]``.
+
+    Examples:
+        >>> adaptive_gamma(torch.tensor([0.0, 0.6, 1.3]))
+        tensor([0.9000, 0.4000, 0.1000])
+    """
+    return (1 - moment).clamp(gamma_min, gamma_max)
+
+
+def bound_ratio(
+    moment: Tensor, gamma_min: float = 0.1, gamma_max: float = 0.9, gamma: float | Tensor | None = None
+) -> Tensor:
+    r"""Mean upper bound of the rating (eq. 12), :math:`\mathbb{E}[\pi^{1-q}] / (1-\gamma)`.
+
+    With the adaptive gamma of eq. 13 the denominator is the moment itself wherever gamma is not clipped, so that the
+    ratio is exactly 1 there and its gradient exactly 0: gradients flow through the clip.
+
+    Args:
+        moment: :math:`\mathbb{E}[\pi^{1-q}]`, ``[*S]``.
+        gamma_min: lower bound of the adaptive gamma.
+        gamma_max: upper bound of the adaptive gamma.
+        gamma: a fixed gamma < 1 instead of the adaptive one.
+
+    Returns:
+        The bound, ``[*S]``; infinite for ``gamma = 1``.
+
+    Examples:
+        >>> bound_ratio(torch.tensor([0.05, 0.6, 1.8]))
+        tensor([0.5000, 1.0000, 2.0000])
+        >>> bound_ratio(torch.tensor(0.6), gamma=0.0)
+        tensor(0.6000)
+    """
+    if gamma is not None:
+        return moment / (1 - _like(gamma, moment))
+    return moment / moment.clamp(1 - gamma_max, 1 - gamma_min)

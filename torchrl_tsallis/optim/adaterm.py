@@ -1,0 +1,199 @@
+"""AdaTerm: an Adam-like optimizer whose moments are robust to outlying gradients."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.optim import Optimizer
+
+from torchrl_tsallis._segments import Segments
+from torchrl_tsallis._student_t import floor_target, robust_rate
+
+__all__ = ["AdaTerm"]
+
+
+class AdaTerm(Optimizer):
+    r"""Adaptive moments estimated under Student's t, so that outlying gradients are damped.
+
+    Per parameter tensor with gradient ``g``, moments ``m``, ``s``, floor ``e`` and degrees of freedom ``nu``::
+
+        d2 = (g - m)^2;  v = s + e;  D = mean(d2 / v);  w = (nu + 1) / (nu + D);  w_max = (nu + 1) / nu
+        t1 = (1-beta1) w / w_max;  t2 = (1-beta2) w / w_max;  de = max(eps^2, (d2 - D v) / nu)
+        m += t1 (g - m);  s += t2 (d2 - s);  e += t2 (de - e);  nu += t_nu (nu* - nu)
+        theta -= lr (m / (1-beta1^t)) / sqrt((s + e) / (1-beta2^t))
+
+    ``t_nu`` and ``nu*`` are those of :func:`torchrl_tsallis._student_t.robust_rate`. ``D``, ``w`` and ``nu`` are
+    scalars per tensor, or per ensemble member with ``batch_dims``. The state of a group is held in flat vectors, and
+    all of its scalars in one tensor, so a step does not read anything back from the device.
+
+    State per parameter: ``step``, ``exp_avg`` (m), ``exp_avg_sq`` (s), ``floor`` (e), ``nu``, ``skipped`` (number of
+    refused updates), and ``max_exp_avg_sq``, ``bias1``, ``bias2`` where the option asks for them.
+
+    Source: Ilboudo, Kobayashi & Matsubara, "AdaTerm: Adaptive T-distribution Estimated Robust Moments for
+    Noise-Robust Stochastic Gradient Optimization", Neurocomputing 2023, arXiv 2201.06714; in this project's reading.
+
+    Args:
+        params: parameters (float32 or float64) or parameter groups; each option below may differ by group.
+        lr: learning rate. Default: 1e-3.
+        betas: decay of the first moment, of the second, and of the degrees of freedom, in [0, 1).
+            Default: (0.9, 0.9, 0.9).
+        eps: square root of the variance's least floor. Default: 1e-5.
+        k: lower bound of the degrees of freedom; ``inf`` switches the robustness off. Default: 1.0.
+        weight_decay: factor of the parameters that is added to the gradient (L2, as in ``torch.optim.Adam``).
+            Default: 0.
+        amsgrad: decay in [0, 1] of the running maximum of the variance; 0 is off, 1 never forgets. Default: 0.
+        uncentered: divide by the uncentered second moment, ``s + e + m^2``. Default: False.
+        adaptive_bias: correct the bias by the accumulated actual rates ``t1``, ``t2`` instead of powers of beta.
+            Default: False.
+        ini_dof: initial degrees of freedom, at least ``k``. Default: None, ``k + eps``.
+        batch_dims: number of leading ensemble dimensions of each parameter; members do not influence each other.
+            Default: 0.
+        skip_nonfinite: leave a tensor (or member) and its state as they are where its gradient is not finite.
+            Default: True.
+
+    Raises:
+        ValueError: for an argument outside of its range, and for parameters of another type or with too few
+            dimensions.
+        RuntimeError: for sparse gradients.
+
+    Examples:
+        >>> x = torch.nn.Parameter(torch.tensor([1.0, -2.0]))
+        >>> optim = AdaTerm([x], lr=0.1)
+        >>> for _ in range(100):
+        ...     optim.zero_grad()
+        ...     x.square().sum().backward()
+        ...     _ = optim.step()
+        >>> bool((x.abs() < 0.1).all())
+        True
+    """
+
+    def __init__(
+        self,
+        params: Iterable[Any],
+        lr: float | Tensor = 1e-3,
+        betas: tuple[float, float, float] = (0.9, 0.9, 0.9),
+        eps: float = 1e-5,
+        k: float = 1.0,
+        weight_decay: float = 0.0,
+        amsgrad: float = 0.0,
+        uncentered: bool = False,
+        adaptive_bias: bool = False,
+        ini_dof: float | None = None,
+        batch_dims: int = 0,
+        skip_nonfinite: bool = True,
+    ) -> None:
+        self._layouts: dict[tuple[Any, ...], _Layout] = {}
+        names = ("betas", "eps", "k", "weight_decay", "amsgrad", "uncentered", "adaptive_bias", "ini_dof")
+        values = (betas, eps, k, weight_decay, amsgrad, uncentered, adaptive_bias, ini_dof)
+        rest = {"lr": lr, "batch_dims": batch_dims, "skip_nonfinite": skip_nonfinite}
+        super().__init__(params, {**rest, **dict(zip(names, values, strict=True))})
+
+    def add_param_group(self, param_group: dict[str, Any]) -> None:
+        """Adds a group of parameters with its own options, after checking them."""
+        super().add_param_group(param_group)
+        try:
+            _check_group(self.param_groups[-1])
+        except ValueError:
+            self.param_groups.pop()
+            raise
+        self._layouts.clear()
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Restores a pickled or loaded state; the flat vectors are rebuilt at the next step."""
+        super().__setstate__(state)
+        self._layouts = {}
+
+    @torch.no_grad()
+    def step(self, closure: Callable[[], Any] | None = None) -> Any:
+        """Updates each parameter that has a gradient.
+
+        Args:
+            closure: recomputes the loss and its gradients. Default: None.
+
+        Returns:
+            The closure's loss, or None.
+        """
+        loss = None
+        if closure is not None:
+            with torch.enable_grad():
+                loss = closure()
+        for index, group in enumerate(self.param_groups):
+            active: dict[tuple[torch.dtype, torch.device], list[Tensor]] = {}
+            for p in group["params"]:
+                if p.grad is None or p.numel() == 0:
+                    continue
+                if p.grad.is_sparse:
+                    raise RuntimeError("AdaTerm does not support sparse gradients; make the layer's gradient dense")
+                active.setdefault((p.dtype, p.device), []).append(p)
+            for kind, params in active.items():
+                options = (group["amsgrad"] > 0, group["adaptive_bias"], group["batch_dims"])
+                layout = self._layouts.get((index, kind))
+                signature = (options, [id(p) for p in params])
+                if layout is None or layout.signature != signature:
+                    layout = self._layouts[(index, kind)] = _Layout(self.state, group, params, signature)
+                layout.step(group, params)
+        return loss
+
+
+def _check_group(group: dict[str, Any]) -> None:
+    """Raises ValueError for options outside of their range and for parameters that do not fit."""
+
+    def check(name: str, valid: bool, wanted: str) -> None:
+        if not valid:
+            raise ValueError(f"{name} must be {wanted}, got {group[name]!r}")
+
+    check("lr", bool(group["lr"] >= 0), "at least 0")
+    betas = group["betas"]
+    check("betas", len(betas) == 3 and all(0 <= b < 1 for b in betas), "three numbers in [0, 1)")
+    check("eps", 0 < group["eps"] < math.inf, "positive and finite")
+    check("k", group["k"] > 0, "positive (inf switches the robustness off)")
+    check("weight_decay", 0 <= group["weight_decay"] < math.inf, "at least 0")
+    check("amsgrad", 0 <= group["amsgrad"] <= 1, "in [0, 1]")
+    dof = group["ini_dof"]
+    valid = dof is None or (dof == group["k"] if math.isinf(group["k"]) else group["k"] <= dof < math.inf)
+    check("ini_dof", valid, f"None, or finite and at least k = {group['k']}")
+    check("batch_dims", isinstance(group["batch_dims"], int) and group["batch_dims"] >= 0, "an integer of at least 0")
+    for p in group["params"]:
+        if p.dtype not in (torch.float32, torch.float64):
+            raise ValueError(f"parameters must be float32 or float64, got {p.dtype}; keep a float32 copy of them")
+        if p.ndim < group["batch_dims"]:
+            raise ValueError(
+                f"a parameter of shape {tuple(p.shape)} has fewer than batch_dims = {group['batch_dims']} dimensions; "
+                "put it in a group of its own with batch_dims=0"
+            )
+
+
+class _Layout:
+    """Flat state of the active parameters of one group, data type and device; ``state`` holds views of it."""
+
+    def __init__(
+        self, state: dict[Any, dict[str, Any]], group: dict[str, Any], params: list[Tensor], signature: Any
+    ) -> None:
+        self.signature = signature
+        self.segments = Segments(params, group["batch_dims"])
+        self.limit = torch.finfo(params[0].dtype).max / 16
+        dof = group["k"] + group["eps"] if group["ini_dof"] is None else group["ini_dof"]
+        scalars = {"step": 0.0, "nu": dof, "skipped": 0.0}
+        scalars |= {"bias1": 0.0, "bias2": 0.0} if group["adaptive_bias"] else {}
+        vectors = {"exp_avg": 0.0, "exp_avg_sq": 0.0, "floor": group["eps"] ** 2}
+        vectors |= {"max_exp_avg_sq": 0.0} if group["amsgrad"] else {}
+        for name, start in {**scalars, **vectors}.items():
+            shapes = self.segments.batch_shapes if name in scalars else self.segments.shapes
+            parts = [
+                state[p][name].to(p) if name in state[p] else p.new_full(shape, start)
+                for p, shape in zip(params, shapes, strict=True)
+            ]
+            flat = self.segments.flatten(parts)
+            setattr(self, name, flat)
+            views = self.segments.scalar_views(flat) if name in scalars else self.segments.views(flat)
+            for p, view in zip(params, views, strict=True):
+                state[p][name] = view
+
+    step_count = property(lambda self: self.__dict__["step"])
+
+    def __getattr__(self, name: str) -> Tensor:
+        raise AttributeError(name)

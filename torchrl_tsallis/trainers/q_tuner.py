@@ -1,0 +1,183 @@
+"""Online tuning of the Tsallis index q (section IV-B)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torchrl.trainers import Trainer, TrainerHookBase
+
+from torchrl_tsallis.functional import bound_ratio, density_moment
+from torchrl_tsallis.objectives.bc import TsallisBCLoss
+from torchrl_tsallis.objectives.reference import MixtureReference
+from torchrl_tsallis.optim import AdaTerm
+
+
+def q_of_phi(phi: Tensor, q_min: float = 0.6) -> Tensor:
+    """Maps the q tuner's free parameter to q in (q_min, 1) (eq. 15).
+
+    Args:
+        phi: free parameter, ``[*S]``; 0 gives the middle of the range.
+        q_min: lower bound of q (0.6, section V-B).
+
+    Returns:
+        q, ``[*S]``.
+
+    Examples:
+        >>> q_of_phi(torch.tensor(0.0))
+        tensor(0.8000)
+    """
+    return q_min + (1 - q_min) * phi.sigmoid()
+
+
+def q_objective(
+    log_prob: Tensor,
+    phi: Tensor,
+    *,
+    q_min: float = 0.6,
+    multiplier: float = 100.0,
+    gamma_min: float = 0.1,
+    gamma_max: float = 0.9,
+    gamma: float | Tensor | None = None,
+) -> Tensor:
+    r"""What the q tuner minimises (eq. 15): the smallest q for which the mean bound of the rating is one.
+
+    .. math:: L(\phi) = q(\phi) + \lambda \left| \frac{\mathbb{E}[\pi^{1-q(\phi)}]}{1-\gamma(\phi)} - 1 \right|
+
+    Args:
+        log_prob: imitator's log-density, ``[*S, B]``; no gradient flows into it.
+        phi: free parameter of q, ``[*S]``.
+        q_min: lower bound of q.
+        multiplier: Lagrange multiplier lambda.
+        gamma_min: lower bound of the adaptive gamma.
+        gamma_max: upper bound of the adaptive gamma.
+        gamma: a fixed gamma instead of the adaptive one.
+
+    Returns:
+        The objective, ``[*S]``.
+
+    Examples:
+        >>> q_objective(torch.full((4,), -1.0), torch.tensor(0.0))  # gamma is not clipped: q alone is left
+        tensor(0.8000)
+    """
+    q = q_of_phi(phi, q_min)
+    moment = density_moment(log_prob.detach(), q)
+    return q + multiplier * (bound_ratio(moment, gamma_min, gamma_max, gamma) - 1).abs()
+
+
+class QTuner(TrainerHookBase):
+    r"""Lowers q as far as the ratings' mean bound stays at one (eqs. 14-15), one step each training step.
+
+    Usable as a hook of TorchRL's trainer (``tuner.register(trainer)``) and in a hand-written loop, by a call of
+    ``tuner.step()`` after the policy's step. It takes the log-densities that the loss has just computed, and writes
+    the new q into ``loss.q``.
+
+    ==========  ===========  =======  ============
+    symbol      argument     default  source
+    ==========  ===========  =======  ============
+    min q       q_min        0.6      section V-B
+    lambda      multiplier   100      section V-B
+    step size   lr           1e-3     as the policy's
+    ==========  ===========  =======  ============
+
+    Args:
+        loss: the loss whose q is tuned. Its q becomes the middle of (q_min, 1).
+
+    Keyword Args:
+        q_min (float): lower bound of q. Default: 0.6.
+        multiplier (float): Lagrange multiplier lambda. Default: 100.
+        lr (float): step size of the tuner's own AdaTerm. Default: 1e-3.
+        optimizer (callable): makes another optimizer from a list of parameters. Default: None.
+
+    Raises:
+        ValueError: if a setting is outside of its range, or the loss rates by another reference than the mixture
+            or with gamma = 1, for which eq. 15 is not defined.
+
+    Examples:
+        >>> from tensordict import TensorDict
+        >>> from torchrl_tsallis import TsallisBCLoss
+        >>> from torchrl_tsallis.modules import make_policy
+        >>> loss = TsallisBCLoss(make_policy(3, 2), gamma_mix=0.0)
+        >>> tuner = QTuner(loss)
+        >>> _ = loss(TensorDict({"observation": torch.zeros(5, 3), "action": torch.zeros(5, 2)}, [5]))
+        >>> objective = tuner.step()
+        >>> 0.6 < loss.q.item() < 1
+        True
+    """
+
+    def __init__(
+        self,
+        loss: TsallisBCLoss,
+        *,
+        q_min: float = 0.6,
+        multiplier: float = 100.0,
+        lr: float = 1e-3,
+        optimizer: Callable[[list[nn.Parameter]], torch.optim.Optimizer] | None = None,
+    ) -> None:
+        if not 0 < q_min < 1:
+            raise ValueError(f"q_min must be in (0, 1), got {q_min}")
+        if multiplier < 0:
+            raise ValueError(f"multiplier must not be negative, got {multiplier}")
+        reference = loss.reference
+        if not isinstance(reference, MixtureReference) or reference.fixed_gamma == 1:
+            raise ValueError(
+                "QTuner needs a loss with the paper's mixture and gamma_mix < 1: eq. 15 divides by 1 - gamma; "
+                "use a fixed q with other references"
+            )
+        self.loss = loss
+        self.reference = reference
+        self.q_min = q_min
+        self.multiplier = multiplier
+        self.phi = nn.Parameter(torch.zeros_like(loss.q))
+        self.optimizer = optimizer([self.phi]) if optimizer else AdaTerm([self.phi], lr=lr)
+        self._write_q()
+
+    def _write_q(self) -> None:
+        with torch.no_grad():
+            self.loss.q.copy_(q_of_phi(self.phi, self.q_min))
+
+    def step(self, log_prob: Tensor | None = None) -> Tensor:
+        """One step of the tuner.
+
+        Args:
+            log_prob: log-densities of a batch, ``[N]``. Default: those of the loss's last ``forward``.
+
+        Returns:
+            The objective before the step, a detached scalar.
+        """
+        objective = q_objective(
+            self.loss.last_log_prob if log_prob is None else log_prob,
+            self.phi,
+            q_min=self.q_min,
+            multiplier=self.multiplier,
+            gamma_min=self.reference.gamma_min,
+            gamma_max=self.reference.gamma_max,
+            gamma=self.reference.fixed_gamma,
+        )
+        self.optimizer.zero_grad()
+        objective.backward()
+        self.optimizer.step()
+        self._write_q()
+        return objective.detach()
+
+    def __call__(self) -> None:
+        """The trainer's hook: one step."""
+        self.step()
+
+    def register(self, trainer: Trainer, name: str = "q_tuner") -> None:
+        """Registers the tuner after each optimizer step, and for checkpoints."""
+        trainer.register_op("post_optim", self)
+        trainer.register_module(name, self)
+
+    def state_dict(self) -> dict[str, Any]:
+        """State: phi and its optimizer's."""
+        return {"phi": self.phi.detach().clone(), "optimizer": self.optimizer.state_dict()}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Restores the state and writes q into the loss."""
+        with torch.no_grad():
+            self.phi.copy_(state_dict["phi"])
+        self.optimizer.load_state_dict(state_dict["optimizer"])
+        self._write_q()
