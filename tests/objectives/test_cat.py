@@ -1,154 +1,166 @@
-"""CAT-soft update against its equations and limits."""
-
 from __future__ import annotations
 
+import io
 import math
 
 import pytest
 import torch
+from tensordict import TensorDict, TensorDictParams
+from tensordict.nn import TensorDictModule
 from torchrl.objectives import SoftUpdate
+from torchrl.objectives.common import LossModule
 
-from torchrl_tsallis import CATSoftUpdate, TsallisBCLoss
-from torchrl_tsallis.modules import make_policy
-
-
-def make_loss(**kwargs) -> TsallisBCLoss:
-    torch.manual_seed(0)
-    return TsallisBCLoss(make_policy(3, 2, hidden=(8,)), **kwargs)
+from torchrl_tsallis.objectives.cat import CATSoftUpdate
 
 
-def move(loss: TsallisBCLoss, seed: int, size: float = 0.1) -> None:
-    generator = torch.Generator().manual_seed(seed)
-    for p in loss.parameters():
-        p.data += size * torch.randn(p.shape, generator=generator, dtype=torch.float32).to(p)
+class _Loss(LossModule):
+    net: TensorDictModule
+    net_params: TensorDictParams
+    target_net_params: TensorDictParams
+
+    def __init__(self, nets, target=True):
+        super().__init__()
+        many = isinstance(nets, list)
+        self.convert_to_functional(nets, "net", expand_dim=len(nets) if many else None, create_target_params=target)
+
+    def _forward_value_estimator_keys(self, **kwargs):
+        pass
+
+    def forward(self, tensordict):
+        return TensorDict({}, [])
 
 
-def target(loss: TsallisBCLoss) -> list[torch.Tensor]:
-    params = loss.target_actor_network_params
-    return [params.get(key).data.clone() for key in sorted(params.keys(True, True), key=str)]
+def _net(seed=0):
+    torch.manual_seed(seed)
+    layers = torch.nn.Sequential(torch.nn.Linear(3, 4), torch.nn.Linear(4, 2))
+    return TensorDictModule(layers, in_keys=["x"], out_keys=["y"]).double()
 
 
-def source(loss: TsallisBCLoss) -> list[torch.Tensor]:
-    params = loss.actor_network_params
-    return [params.get(key).data.clone() for key in sorted(params.keys(True, True), key=str)]
+def _leaves(params):
+    return [params.get(k).data for k in sorted(params.keys(True, True), key=str)]
 
 
-def test_plain_soft_update_is_the_limit():
-    ours, theirs = make_loss(), make_loss()
-    updater, soft = CATSoftUpdate(ours, tau=0.2, nu=math.inf, strength=0.0), SoftUpdate(theirs, tau=0.2)
-    for step in range(5):
-        move(ours, step)
-        move(theirs, step)
-        updater.step()
-        soft.step()
-    torch.testing.assert_close(target(ours), target(theirs))
+def _move(loss, seed, index=None):
+    """Moves all parameters, the same for member `index` of an ensemble as for a loss of its own."""
+    for i, p in enumerate(_leaves(loss.net_params)):
+        gen = torch.Generator().manual_seed(100 * seed + i)
+        noise = torch.randn((2, *p.shape[1:]) if index is None else (2, *p.shape), generator=gen, dtype=p.dtype)
+        p.add_(0.01 * (noise if index is None else noise[index]))
 
 
-@pytest.mark.parametrize("strength", [0.0, 0.5, 1.0])
-def test_equals_the_equations(strength):
-    tau, eps, k = 0.1, 1e-3, 1.0
-    loss = make_loss().double()
-    updater = CATSoftUpdate(loss, tau=tau, eps=eps, strength=strength, init_scale="eps")
-    bars = target(loss)
-    scales, nus = [torch.full_like(x, eps**2) for x in bars], [k + eps] * len(bars)
+def test_is_soft_update_in_the_limit():
+    first, second = _Loss(_net()), _Loss(_net())
+    cat, soft = CATSoftUpdate(first, tau=0.1, strength=0.0, k=math.inf), SoftUpdate(second, tau=0.1)
+    for i in range(20):
+        _move(first, i, 0), _move(second, i, 0)
+        cat.step(), soft.step()
+    for a, b in zip(_leaves(first.target_net_params), _leaves(second.target_net_params), strict=True):
+        torch.testing.assert_close(a, b, rtol=1e-12, atol=1e-14)
+    for a, b in zip(_leaves(first.net_params), _leaves(second.net_params), strict=True):
+        assert torch.equal(a, b)
+
+
+@pytest.mark.parametrize("strength", [0.0, 0.5])
+def test_single_step_by_hand(strength):
+    loss = _Loss(TensorDictModule(torch.nn.Linear(1, 1, bias=False), in_keys=["x"], out_keys=["y"]).double())
+    updater = CATSoftUpdate(loss, tau=0.4, strength=strength, eps=0.5, init_scale="eps")
+    theta, target = _leaves(loss.net_params)[0], _leaves(loss.target_net_params)[0]
+    target.fill_(0.0), theta.fill_(1.0)
+    updater.step()
+    # d2 = 1, v = 0.25, D = 4, nu = 1.5: w / w_max = 1.5 / 5.5, floor = max(0.25, 0) = 0.25
+    t = 0.4 * 1.5 / 5.5
+    assert target.item() == pytest.approx(t, rel=1e-12)
+    assert theta.item() == pytest.approx(1 - strength * (0.4 - t), rel=1e-12)
+    state = updater.state_dict()["cat"]["target_net_params"]
+    w, largest = 2.5 / 5.5, 2.5 / 1.5
+    w_nu, bound = w - math.log(w), -math.log(torch.finfo(torch.float64).tiny)
+    star = (3.5 / 2.5 + 1.5) / w_nu * (1 - 1 / 1.5) + 1.5
+    assert largest - math.log(largest) < bound
+    assert next(iter(state["nu"].values())).item() == pytest.approx(1.5 + 0.4 * w_nu / bound * (star - 1.5), rel=1e-12)
+    assert next(iter(state["scale"].values())).item() == pytest.approx(0.25 + t * (1.25 - 0.25), rel=1e-12)
+
+
+def test_members_are_independent():
+    ensemble = _Loss([_net(0), _net(1)])
+    solo = [_Loss(_net(0)), _Loss(_net(1))]
+    together, alone = CATSoftUpdate(ensemble), [CATSoftUpdate(x) for x in solo]
     for step in range(20):
-        move(loss, step, size=1.0 if step == 10 else 0.01)
-        thetas = source(loss)
-        updater.step()
-        expected = []
-        for i, theta in enumerate(thetas):
-            nu, d = nus[i], theta - bars[i]
-            big_d = (d**2 / scales[i]).mean().item()
-            w, w_max = (nu + 1) / (nu + big_d), (nu + 1) / nu
-            t = tau * w / w_max
-            w_nu = w - math.log(w)
-            w_nu_max = max(w_max - math.log(w_max), -math.log(torch.finfo(torch.float64).tiny))
-            star = ((nu + 2) / (nu + 1) + nu) / w_nu * (1 - k / nu) + k + eps
-            extra = ((d**2 - big_d * scales[i]) / nu).clamp_min(eps**2)
-            bars[i] = bars[i] + t * d
-            scales[i] = scales[i] + t * (d**2 + extra - scales[i])
-            nus[i] = nu + tau * w_nu / w_nu_max * (star - nu)
-            expected.append(theta - strength * (tau - t) * d)
-        torch.testing.assert_close(target(loss), bars, rtol=1e-9, atol=1e-12)
-        torch.testing.assert_close(source(loss), expected, rtol=1e-9, atol=1e-12)
+        _move(ensemble, step)
+        together.step()
+        for i in range(2):
+            _move(solo[i], step, i)
+            alone[i].step()
+    for i in range(2):
+        for name in ("net_params", "target_net_params"):
+            for a, b in zip(_leaves(getattr(ensemble, name)), _leaves(getattr(solo[i], name)), strict=True):
+                torch.testing.assert_close(a[i], b, rtol=1e-10, atol=1e-14)
 
 
-def test_starting_at_the_first_deviation_follows_at_once():
-    followed = {}
-    for start in ("first", "eps"):
-        loss = make_loss()
-        updater = CATSoftUpdate(loss, tau=0.1, strength=0.0, init_scale=start)
-        before = target(loss)
-        move(loss, 0)
-        updater.step()
-        followed[start] = sum((a - b).abs().sum().item() for a, b in zip(target(loss), before, strict=True))
-    assert followed["first"] > 0.1 > 100 * followed["eps"]
-
-
-def test_an_outlying_step_is_refused_and_consolidated():
-    loss = make_loss()
-    updater = CATSoftUpdate(loss, tau=0.1, strength=1.0)
-    for step in range(50):
-        move(loss, step, size=1e-3)
-        updater.step()
-    thetas, bars = source(loss), target(loss)
-    move(loss, 99, size=10.0)
-    jumped = source(loss)
-    updater.step()
-    gap = sum((a - b).abs().sum() for a, b in zip(jumped, bars, strict=True))
-    moved = sum((a - b).abs().sum() for a, b in zip(target(loss), bars, strict=True))
-    pulled = sum((a - b).abs().sum() for a, b in zip(source(loss), jumped, strict=True))
-    assert moved < 0.01 * gap
-    assert 0.05 * gap < pulled < 0.101 * gap
-    assert len(thetas) == len(bars)
-
-
-def test_no_change_keeps_the_target_and_everything_finite():
-    loss = make_loss()
+def test_state_dict_round_trip_is_exact():
+    loss = _Loss(_net())
     updater = CATSoftUpdate(loss)
-    before = target(loss)
-    for _ in range(3):
+    for i in range(5):
+        _move(loss, i, 0)
         updater.step()
-    torch.testing.assert_close(target(loss), before)
-    assert all(x.isfinite().all() for x in [*target(loss), *source(loss)])
+    file = io.BytesIO()
+    torch.save({"loss": loss.state_dict(), "updater": updater.state_dict()}, file)
+    file.seek(0)
+    saved = torch.load(file, weights_only=True)
+    other = _Loss(_net(3))
+    resumed = CATSoftUpdate(other)
+    other.load_state_dict(saved["loss"])
+    resumed.load_state_dict(saved["updater"])
+    for i in range(5, 10):
+        _move(loss, i, 0), _move(other, i, 0)
+        updater.step(), resumed.step()
+    for a, b in zip(_leaves(loss.target_net_params), _leaves(other.target_net_params), strict=True):
+        assert torch.equal(a, b)
+    state = updater.state_dict()
+    del state["cat"]["target_net_params"]["nu"]["module.0.bias"]
+    with pytest.raises(KeyError, match=r"'nu' of 'module.0.bias'"):
+        resumed.load_state_dict(state)
+    state = updater.state_dict()
+    state["cat"]["target_net_params"]["scale"]["module.0.bias"] = torch.zeros(7)
+    with pytest.raises(ValueError, match=r"module.0.bias.*\(7,\).*\(4,\)"):
+        resumed.load_state_dict(state)
 
 
-def test_a_loss_without_target_network_costs_nothing():
-    loss = make_loss(gamma_mix=0.0)
-    before = source(loss)
+def test_follows_the_data_type():
+    loss = _Loss(_net().float())
+    updater = CATSoftUpdate(loss)
+    loss.double()
+    _move(loss, 0, 0)
+    updater.step()
+    assert updater.state_dict()["cat"]["target_net_params"]["scale"]["module.0.bias"].dtype == torch.float64
+
+
+def test_first_scale_waits_for_a_difference():
+    loss = _Loss(_net())
+    updater = CATSoftUpdate(loss, strength=0.0)
+    updater.step()
+    _move(loss, 0, 0)
+    before = [x.clone() for x in _leaves(loss.target_net_params)]
+    updater.step()
+    # D = 1 and nu = 1 + eps: the share is nu / (nu + 1)
+    share = (1 + 1e-5) / (2 + 1e-5)
+    rows = zip(before, _leaves(loss.target_net_params), _leaves(loss.net_params), strict=True)
+    for old, new, theta in rows:
+        torch.testing.assert_close(new, old + 0.1 * share * (theta - old), rtol=1e-10, atol=1e-14)
+
+
+def test_without_target_nothing_happens():
+    loss = _Loss(_net(), target=False)
+    before = [x.clone() for x in _leaves(loss.net_params)]
     updater = CATSoftUpdate(loss)
     updater.step()
-    torch.testing.assert_close(source(loss), before)
     updater.load_state_dict(updater.state_dict())
-
-
-def test_state_dict_continues_bit_for_bit():
-    a, b = make_loss(), make_loss()
-    one, two = CATSoftUpdate(a), CATSoftUpdate(b)
-    for step in range(5):
-        move(a, step)
-        one.step()
-    b.load_state_dict(a.state_dict())
-    two.load_state_dict(one.state_dict())
-    for step in range(5, 10):
-        for loss, updater in ((a, one), (b, two)):
-            move(loss, step)
-            updater.step()
-    assert all(torch.equal(x, y) for x, y in zip(target(a) + source(a), target(b) + source(b), strict=True))
-
-
-def test_a_state_of_another_network_is_named():
-    state = CATSoftUpdate(make_loss()).state_dict()
-    other = CATSoftUpdate(TsallisBCLoss(make_policy(3, 2, hidden=(9,))))
-    with pytest.raises(ValueError, match=r"bias has shape \[9\].*\[8\]"):
-        other.load_state_dict(state)
-    with pytest.raises(ValueError, match="same loss"):
-        CATSoftUpdate(make_loss(gamma_mix=0.0)).load_state_dict(state)
+    for a, b in zip(before, _leaves(loss.net_params), strict=True):
+        assert torch.equal(a, b)
 
 
 @pytest.mark.parametrize(
-    "kwargs", [{"tau": 0.0}, {"strength": 2.0}, {"eps": 0.0}, {"k": 0.0}, {"nu": 0.5}, {"init_scale": "zero"}]
+    "options", [{"tau": 2.0}, {"strength": -1.0}, {"eps": 0.0}, {"k": 0.0}, {"init_scale": "x"}], ids=str
 )
-def test_arguments_out_of_range(kwargs):
-    with pytest.raises(ValueError, match=next(iter(kwargs))):
-        CATSoftUpdate(make_loss(), **kwargs)
+def test_wrong_arguments(options):
+    with pytest.raises(ValueError, match=next(iter(options))):
+        CATSoftUpdate(_Loss(_net()), **options)

@@ -1,68 +1,63 @@
-"""Consolidated adaptive T-soft update of target networks."""
+"""CAT-soft: a target update that follows the policy robustly, and pulls it back where it refuses to follow."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping
 from typing import Any, Literal
 
 import torch
-from tensordict.utils import unravel_key
 from torch import Tensor
-from torchrl.objectives import LossModule
+from torchrl.objectives.common import LossModule
 from torchrl.objectives.utils import TargetNetUpdater
 
-from torchrl_tsallis._student_t import degrees_of_freedom_step, robust_share, spread, tensor_means
+from torchrl_tsallis._segments import Segments
+from torchrl_tsallis._student_t import floor_target, robust_rate
+
+__all__ = ["CATSoftUpdate"]
+
+_SCALARS = ("nu", "started")
 
 
 class CATSoftUpdate(TargetNetUpdater):
-    r"""Robust soft update: a target network that follows usual changes of the policy, and outlying ones less.
+    r"""Consolidated adaptive T-soft update of the target parameters.
 
-    For each parameter tensor, with :math:`d = \theta - \bar\theta` and :math:`D = \mathrm{mean}(d^2 / v)`:
+    Per parameter tensor ``theta`` with target ``thetabar``, scale ``v`` and degrees of freedom ``nu``::
 
-    .. math::
-        t &= \tau \frac{\nu}{\nu + D}, \quad
-        \bar\theta \leftarrow \bar\theta + t d, \quad
-        v \leftarrow v + t \left(d^2 + \max\left(\epsilon^2, \frac{d^2 - D v}{\nu}\right) - v\right), \\
-        \theta &\leftarrow \theta - \mathrm{strength} \, (\tau - t) \, d
+        d2 = (theta - thetabar)^2;  D = mean(d2 / v);  w = (nu + 1) / (nu + D);  w_max = (nu + 1) / nu
+        t  = tau w / w_max
+        thetabar += t (theta - thetabar);  v += t (d2 + max(eps^2, (d2 - D v) / nu) - v);  nu += t_nu (nu* - nu)
+        theta -= strength (tau - t) (theta - thetabar_before)
 
-    The degrees of freedom :math:`\nu` follow the data as in AdaTerm. The last line, the consolidation, brings the
-    policy back towards the target where the target refused to follow.
-    :class:`torchrl.objectives.SoftUpdate` is the limit of ``nu=inf, strength=0``.
+    ``t_nu`` and ``nu*`` are those of :func:`torchrl_tsallis._student_t.robust_rate` with rate ``tau``. Leading
+    dimensions of stacked (ensemble) parameters have scalars of their own. ``k=inf, strength=0`` is torchrl's
+    ``SoftUpdate(tau=tau)``. A loss without target parameters is accepted; nothing is updated then. Call
+    :meth:`step` after the optimizer's step. A deep copy of the updater no longer follows: make a new one.
 
-    ==================  ===========  ==========  =========================================
-    symbol              argument     default     source
-    ==================  ===========  ==========  =========================================
-    tau                 tau          0.1         this project
-    consolidation       strength     1.0         this project's reading of arXiv 2202.12504
-    epsilon             eps          1e-5        AdaTerm's
-    k                   k            1.0         AdaTerm's
-    start of nu         nu           k + eps     AdaTerm's
-    start of v          init_scale   "first"     this project
-    ==================  ===========  ==========  =========================================
-
-    Source: Kobayashi, "Consolidated adaptive T-soft update", arXiv 2202.12504, as read by this project.
+    Source: Kobayashi, "Consolidated Adaptive T-soft Update for Deep Reinforcement Learning", arXiv 2202.12504. The
+    consolidation is this project's reading: the refused share is applied the other way.
 
     Args:
-        loss_module: a loss with target parameters. For a loss without them every step does nothing.
+        loss_module: the loss whose target parameters are updated.
 
     Keyword Args:
-        tau (float): largest rate in (0, 1]. Default: 0.1.
-        strength (float): consolidation in [0, 1]; 0 leaves the policy alone. Default: 1.0.
-        eps (float): square root of the scale's floor. Default: 1e-5.
-        k (float): lower bound of the degrees of freedom. Default: 1.0.
-        nu (float): first degrees of freedom, ``inf`` for a plain soft update. Default: ``k + eps``.
-        init_scale ("first" or "eps"): start of v. From ``eps**2`` every step is an outlier until v has grown, some
-            hundred steps; ``"first"`` starts at the first :math:`d^2`. Default: ``"first"``.
+        tau (float): largest rate of the target, in [0, 1]. Default: 0.1.
+        strength (float): strength of the consolidation, in [0, 1]; 0 is AT-soft. Default: 1.0.
+        eps (float): square root of the scale's least value. Default: 1e-5.
+        k (float): lower bound of the degrees of freedom; ``inf`` switches the robustness off. Default: 1.0.
+        init_scale ("first" or "eps"): start the scale at the mean of the tensor's first squared difference that is
+            not 0, or at ``eps^2``, where the first steps are all taken for outliers. Default: ``"first"``.
 
     Raises:
-        ValueError: if an argument is outside of its range, or a state of another network is loaded.
+        ValueError: for an argument outside of its range, and for a state dict that does not fit.
+        KeyError: for a state dict that lacks an entry.
 
     Examples:
-        >>> from torchrl_tsallis import TsallisBCLoss
         >>> from torchrl_tsallis.modules import make_policy
+        >>> from torchrl_tsallis.objectives.bc import TsallisBCLoss
         >>> loss = TsallisBCLoss(make_policy(3, 2))
-        >>> CATSoftUpdate(loss, tau=0.01).step()
+        >>> updater = CATSoftUpdate(loss, tau=0.1)
+        >>> updater.step()
     """
 
     def __init__(
@@ -73,131 +68,118 @@ class CATSoftUpdate(TargetNetUpdater):
         strength: float = 1.0,
         eps: float = 1e-5,
         k: float = 1.0,
-        nu: float | None = None,
         init_scale: Literal["first", "eps"] = "first",
     ) -> None:
-        if not 0 < tau <= 1:
-            raise ValueError(f"tau must be in (0, 1], got {tau}")
-        if not 0 <= strength <= 1:
-            raise ValueError(f"strength must be in [0, 1], got {strength}")
-        if eps <= 0 or k <= 0:
-            raise ValueError(f"eps and k must be positive, got {eps=} and {k=}")
-        if nu is not None and nu <= k:
-            raise ValueError(f"nu must be larger than k = {k}, got {nu}")
+        for name, value in (("tau", tau), ("strength", strength)):
+            if not 0 <= value <= 1:
+                raise ValueError(f"{name} must be in [0, 1], got {value}")
+        if not 0 < eps < math.inf:
+            raise ValueError(f"eps must be positive and finite, got {eps}")
+        if not k > 0:
+            raise ValueError(f"k must be positive (inf switches the robustness off), got {k}")
         if init_scale not in ("first", "eps"):
             raise ValueError(f"init_scale must be 'first' or 'eps', got {init_scale!r}")
-        self.tau, self.strength, self.eps, self.k = tau, strength, eps, k
-        self.first_nu = k + eps if nu is None else nu
-        self.init_scale = init_scale
-        self._state: dict[str, dict[str, Any]] = {}
-        self.enabled = any(name.startswith("target_") for name, _ in loss_module.named_children())
-        if self.enabled:
+        self.tau, self.strength, self.eps, self.k, self.init_scale = tau, strength, eps, k, init_scale
+        self._cat: dict[str, _Group] = {}
+        names = [n for n, _ in loss_module.named_children()] if isinstance(loss_module, LossModule) else [""]
+        self._active = any(n == "" or (n.startswith("target_") and n.endswith("_params")) for n in names)
+        if self._active:
             super().__init__(loss_module)
+        else:
+            self.loss_module, self.initialized = loss_module, True
+            self._target_names: list[str] = []
+            self._source_names: list[str] = []
 
     def init_(self) -> None:
-        """Copies the policy into the target and starts the state anew; part of the construction."""
-        if not self.enabled:
+        """Copies the parameters to the target and starts the state anew."""
+        if not self._active:
             return
         super().init_()
-        self._state = {}
-        for name, target in self._targets.items():
-            keys = sorted(target.keys(True, True), key=str)
-            tensors = [target.get(key) for key in keys]
-            members = target.batch_size
-            self._state[name] = {
-                "keys": keys,
-                "v": [torch.full_like(x, self.eps**2) for x in tensors],
-                "nu": tensors[0].new_full((len(keys), *members), self.first_nu),
-                "started": torch.zeros((), dtype=torch.bool),
-            }
+        self._cat = {name: _Group(self, target) for name, target in self._targets.items()}
 
     @torch.no_grad()
     def step(self) -> None:
-        """Moves every target network, and the policy where consolidation asks for it."""
-        for name in self._state:
-            source = self._sources[name.removeprefix("target_")]
-            self._step_group(source, self._targets[name], self._state[name])
-
-    def _step_group(self, source: Any, target: Any, state: dict[str, Any]) -> None:
-        nb = target.batch_dims
-        new = [source.get(key).data for key in state["keys"]]
-        old = [target.get(key).data for key in state["keys"]]
-        deviation = torch._foreach_sub(new, old)
-        if not math.isfinite(self.first_nu):
-            torch._foreach_add_(old, deviation, alpha=self.tau)
-            return
-        # Follow the loss to another device or dtype.
-        state["v"] = v = [x.to(like) for x, like in zip(state["v"], old, strict=True)]
-        state["nu"] = nu = state["nu"].to(old[0])
-        square = torch._foreach_mul(deviation, deviation)
-        if self.init_scale == "first" and not state["started"]:
-            self._start(v, square, nb)
-            state["started"].fill_(bool(any(x.any() for x in square)))
-        distance = tensor_means(torch._foreach_div(square, v), nb)
-        share = robust_share(distance, nu)
-        state["nu"] = degrees_of_freedom_step(distance, nu, self.tau, self.k, self.eps)
-        rate = self.tau * share
-        by_rate = spread(rate, old, nb)
-
-        floor = torch._foreach_mul(v, spread(-distance, old, nb))
-        torch._foreach_add_(floor, square)
-        torch._foreach_div_(floor, spread(nu, old, nb))
-        torch._foreach_clamp_min_(floor, self.eps**2)
-        torch._foreach_add_(floor, square)
-        torch._foreach_sub_(floor, v)
-        torch._foreach_mul_(floor, by_rate)
-        torch._foreach_add_(v, floor)
-        torch._foreach_add_(old, torch._foreach_mul(deviation, by_rate))
-        if self.strength:
-            torch._foreach_mul_(deviation, spread((rate - self.tau) * self.strength, old, nb))
-            torch._foreach_add_(new, deviation)
-
-    def _start(self, v: list[Tensor], square: Sequence[Tensor], nb: int) -> None:
-        """Starts each scale at its tensor's mean squared deviation: single entries may not have moved yet."""
-        for scale, mean in zip(v, spread(tensor_means(square, nb), v, nb), strict=True):
-            scale.copy_(mean.clamp_min(self.eps**2).expand_as(scale))
+        """Updates the targets, and the parameters by the consolidation."""
+        for name, source in self._sources.items() if self._active else ():
+            group = self._cat[f"target_{name}"]
+            target = self._targets.get(f"target_{name}")
+            group.step(self, [source.get(k).data for k in group.keys], [target.get(k).data for k in group.keys])
 
     def state_dict(self) -> dict[str, Any]:
-        """Scale, degrees of freedom and start flag of every parameter, under ``cat``."""
-        groups = {
-            name: {
-                "v": {_dotted(key): x.clone() for key, x in zip(state["keys"], state["v"], strict=True)},
-                "nu": state["nu"].clone(),
-                "started": state["started"].clone(),
-            }
-            for name, state in self._state.items()
+        """Copy of the complete state: ``cat/<target group>/<scale|nu|started>/<dotted key>``."""
+        return {**super().state_dict(), "cat": {name: group.state_dict() for name, group in self._cat.items()}}
+
+    def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
+        """Loads a state in place, after checking all of it."""
+        state = state_dict.get("cat", {})
+        if set(state) != set(self._cat):
+            raise KeyError(f"groups of the state dict are {sorted(state)}, of the loss {sorted(self._cat)}")
+        for check_only in (True, False):
+            for name, group in self._cat.items():
+                group.load(name, state[name], check_only)
+        super().load_state_dict(state_dict)
+
+
+class _Group:
+    """State of one group of target parameters: flat ``scale``, stacked ``nu`` and ``started``."""
+
+    def __init__(self, updater: CATSoftUpdate, target: Any) -> None:
+        self.keys = sorted(target.keys(True, True), key=str)
+        self.names = [k if isinstance(k, str) else ".".join(k) for k in self.keys]
+        leaves = [target.get(k).data for k in self.keys]
+        self.segments = Segments(leaves, target.batch_dims)
+        flat, eps = self.segments.flatten(leaves), updater.eps
+        count, first = self.segments.num_segments, updater.init_scale == "first"
+        self.state = {
+            "scale": torch.full_like(flat, eps**2),
+            "nu": flat.new_full((count,), updater.k + eps),
+            "started": flat.new_full((count,), 0.0 if first else 1.0),
         }
-        return {**(super().state_dict() if self.enabled else {}), "cat": groups}
 
-    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Restores what :meth:`state_dict` gave.
+    def step(self, updater: CATSoftUpdate, source: list[Tensor], target: list[Tensor]) -> None:
+        """One update, in place of both lists."""
+        seg, eps, tau = self.segments, updater.eps, updater.tau
+        old, d = seg.flatten(target), seg.flatten(source)
+        d.sub_(old)
+        if self.state["scale"].dtype != d.dtype or self.state["scale"].device != d.device:
+            self.state = {name: x.to(d) for name, x in self.state.items()}
+            seg.ids = seg.ids.to(d.device)
+        v, nu, started = (self.state[name] for name in ("scale", "nu", "started"))
+        d2 = d.square().clamp_(max=torch.finfo(d.dtype).max / 16)
+        if updater.init_scale == "first":
+            first = seg.mean(d2)
+            fresh = (started == 0) & (first > 0)
+            v.copy_(torch.where(seg.expand(fresh), seg.expand(first.clamp(eps**2, torch.finfo(d.dtype).max / 16)), v))
+            started.masked_fill_(fresh, 1.0)
+        distance = seg.mean(d2 / v)
+        share, new_nu = robust_rate(distance, nu, tau, updater.k, eps)
+        floor = floor_target(d2, v, seg.expand(distance), seg.expand(nu.reciprocal()), eps)
+        v.addcmul_(seg.expand(share), d2.add_(floor).sub_(v), value=tau)
+        nu.copy_(new_nu)
+        torch._foreach_add_(target, seg.views(seg.expand(tau * share) * d))
+        if updater.strength:
+            torch._foreach_sub_(source, seg.views(seg.expand(updater.strength * tau * (1 - share)) * d))
 
-        Raises:
-            ValueError: if the state is of another network; the message names the parameter and both shapes.
-        """
-        state_dict = dict(state_dict)
-        groups = state_dict.pop("cat")
-        if self.enabled:
-            super().load_state_dict(state_dict)
-        if set(groups) != set(self._state):
-            raise ValueError(
-                f"the state is of {sorted(groups)}, this updater of {sorted(self._state)}: load it into "
-                "an updater of the same loss"
-            )
-        for name, state in self._state.items():
-            saved = groups[name]
-            for key, own in zip(state["keys"], state["v"], strict=True):
-                found = saved["v"].get(_dotted(key))
-                if found is None or found.shape != own.shape:
+    def views(self, name: str) -> dict[str, Tensor]:
+        """Views of one entry of the state by dotted key."""
+        split = self.segments.scalar_views if name in _SCALARS else self.segments.views
+        return dict(zip(self.names, split(self.state[name]), strict=True))
+
+    def state_dict(self) -> dict[str, dict[str, Tensor]]:
+        """Copies of the state by name and dotted key."""
+        return {name: {key: x.clone() for key, x in self.views(name).items()} for name in self.state}
+
+    def load(self, group: str, state: Mapping[str, Mapping[str, Tensor]], check_only: bool) -> None:
+        """Checks or copies a state."""
+        for name in self.state:
+            for key, x in self.views(name).items():
+                if key not in state.get(name, {}):
+                    raise KeyError(f"the state dict of group {group!r} has no {name!r} of {key!r}")
+                value = state[name][key]
+                if value.shape != x.shape:
                     raise ValueError(
-                        f"{name}.{_dotted(key)} has shape {list(own.shape)}, in the state "
-                        f"{None if found is None else list(found.shape)}: build the checkpoint's network"
+                        f"{name!r} of {key!r} in group {group!r} has shape {tuple(value.shape)} in the state dict, "
+                        f"{tuple(x.shape)} in the loss; load it in a loss of the same architecture"
                     )
-                own.copy_(found)
-            state["nu"] = saved["nu"].clone().to(state["nu"])
-            state["started"] = saved["started"].clone()
-
-
-def _dotted(key: Any) -> str:
-    key = unravel_key(key)
-    return key if isinstance(key, str) else ".".join(key)
+                if not check_only:
+                    x.copy_(value)

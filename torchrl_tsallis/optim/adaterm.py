@@ -63,11 +63,11 @@ class AdaTerm(Optimizer):
     Examples:
         >>> x = torch.nn.Parameter(torch.tensor([1.0, -2.0]))
         >>> optim = AdaTerm([x], lr=0.1)
-        >>> for _ in range(100):
+        >>> for _ in range(1000):
         ...     optim.zero_grad()
         ...     x.square().sum().backward()
         ...     _ = optim.step()
-        >>> bool((x.abs() < 0.1).all())
+        >>> bool((x.abs() < 0.2).all())
         True
     """
 
@@ -175,6 +175,7 @@ class _Layout:
     ) -> None:
         self.signature = signature
         self.segments = Segments(params, group["batch_dims"])
+        self.flat: dict[str, Tensor] = {}
         self.limit = torch.finfo(params[0].dtype).max / 16
         dof = group["k"] + group["eps"] if group["ini_dof"] is None else group["ini_dof"]
         scalars = {"step": 0.0, "nu": dof, "skipped": 0.0}
@@ -188,12 +189,62 @@ class _Layout:
                 for p, shape in zip(params, shapes, strict=True)
             ]
             flat = self.segments.flatten(parts)
-            setattr(self, name, flat)
+            self.flat[name] = flat
             views = self.segments.scalar_views(flat) if name in scalars else self.segments.views(flat)
             for p, view in zip(params, views, strict=True):
                 state[p][name] = view
 
-    step_count = property(lambda self: self.__dict__["step"])
+    def step(self, group: dict[str, Any], params: list[Tensor]) -> None:
+        """One update of the parameters from their gradients."""
+        seg, f, (beta1, beta2, beta_nu), eps = self.segments, self.flat, group["betas"], group["eps"]
+        m, s, floor, nu = f["exp_avg"], f["exp_avg_sq"], f["floor"], f["nu"]
+        d = seg.flatten([p.grad for p in params if p.grad is not None])
+        if group["weight_decay"]:
+            d.add_(seg.flatten(params), alpha=group["weight_decay"])
+        d.sub_(m)
+        d2 = d.square().clamp_(max=self.limit)
+        v = s + floor
+        distance = seg.mean(d2 / v)
+        if group["skip_nonfinite"]:
+            bad = seg.mean(d * 0).isnan()
+            distance = distance.masked_fill(bad, 0.0)
+            d.nan_to_num_(0.0, 0.0, 0.0)
+            d2.nan_to_num_(0.0)
+        share, new_nu = robust_rate(distance, nu, 1 - beta_nu, group["k"], eps)
+        if group["skip_nonfinite"]:
+            share, new_nu = share.masked_fill(bad, 0.0), torch.where(bad, nu, new_nu)
+            f["skipped"].add_(bad)
+            f["step"].add_(~bad)
+        else:
+            f["step"].add_(1)
+        de = floor_target(d2, v, seg.expand(distance), seg.expand(nu.reciprocal()), eps)
+        share_flat = seg.expand(share)
+        m.addcmul_(share_flat, d, value=1 - beta1)
+        s.addcmul_(share_flat, d2.sub_(s), value=1 - beta2)
+        floor.addcmul_(share_flat, de.sub_(floor), value=1 - beta2)
+        nu.copy_(new_nu)
+        v = s + floor
+        if group["uncentered"]:
+            v.addcmul_(m, m).clamp_(max=self.limit)
+        if group["amsgrad"]:
+            largest = f["max_exp_avg_sq"]
+            v = torch.maximum(largest * group["amsgrad"], v)
+            if group["skip_nonfinite"]:
+                v = torch.where(seg.expand(bad), largest, v)
+            largest.copy_(v)
+        scale = self._bias_correction(group, share, beta1, beta2) * group["lr"]
+        if group["skip_nonfinite"]:
+            scale, v = scale.masked_fill(bad, 0.0), v.clamp_(min=torch.finfo(v.dtype).tiny)
+        update = seg.views(seg.expand(scale) * m / v.sqrt_())
+        torch._foreach_sub_(params, update)
 
-    def __getattr__(self, name: str) -> Tensor:
-        raise AttributeError(name)
+    def _bias_correction(self, group: dict[str, Any], share: Tensor, beta1: float, beta2: float) -> Tensor:
+        """Returns ``sqrt(c2) / c1`` for the corrections c1, c2 of the two moments, ``[S]``."""
+        f, tiny = self.flat, torch.finfo(share.dtype).tiny
+        if group["adaptive_bias"]:
+            c1, c2 = f["bias1"], f["bias2"]
+            c1.add_((1 - beta1) * share * (1 - c1))
+            c2.add_((1 - beta2) * share * (1 - c2))
+            return c2.sqrt() / c1.clamp(min=tiny)
+        c1, c2 = (-torch.expm1(f["step"] * math.log(max(b, tiny))) for b in (beta1, beta2))
+        return c2.sqrt() / c1.clamp(min=tiny)
