@@ -47,6 +47,7 @@ class Segments:
         self.num_segments = sum(self.counts)
         lengths = [n // b for n, b in zip(self.sizes, self.counts, strict=True) for _ in range(b)]
         device = tensors[0].device
+        self.reciprocals = torch.tensor([1 / max(n, 1) for n in lengths], dtype=torch.float64, device=device)
         self.ids = torch.repeat_interleave(torch.tensor(lengths, device=device))
 
     def flatten(self, tensors: Sequence[Tensor]) -> Tensor:
@@ -68,4 +69,7 @@ class Segments:
     def mean(self, flat: Tensor) -> Tensor:
         """Mean over each segment of a vector ``[N]``, stacked, ``[S]``."""
         parts = flat.split(self.sizes)
-        return torch.cat([x.view(c, -1).mean(-1) for x, c in zip(parts, self.counts, strict=True)])
+        if self.num_segments == len(parts):  # a full sum costs half of a sum over a dimension
+            return torch.stack([x.sum() for x in parts]) * self.reciprocals.to(flat.dtype)
+        sums = torch.cat([x.view(c, -1).sum(-1) for x, c in zip(parts, self.counts, strict=True)])
+        return sums * self.reciprocals.to(flat.dtype)

@@ -204,9 +204,12 @@ class _Layout:
         d.sub_(m)
         d2 = d.square().clamp_(max=self.limit)
         v = s + floor
-        distance = seg.mean(d2 / v)
+        ratio = d2 / v
         if group["skip_nonfinite"]:
-            bad = seg.mean(d * 0).isnan()
+            ratio.add_(d * 0)  # NaN where the gradient is not finite; d2 was clamped and no longer shows it
+        distance = seg.mean(ratio)
+        if group["skip_nonfinite"]:
+            bad = distance.isnan()
             distance = distance.masked_fill(bad, 0.0)
             d.nan_to_num_(0.0, 0.0, 0.0)
             d2.nan_to_num_(0.0)

@@ -1,0 +1,159 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from torchrl_tsallis.evaluation.rollouts import MeanPolicy, evaluate_policies, run_episode
+from torchrl_tsallis.modules import make_policy
+
+# Written to a module of its own, because a spawned worker must be able to import it.
+DUMMY = '''
+import os
+import pathlib
+import types
+
+import numpy as np
+
+MARK = pathlib.Path(__file__).with_name("deaths")
+
+
+class Env:
+    action_space = types.SimpleNamespace(low=-np.ones(2, np.float32), high=np.ones(2, np.float32))
+
+    def reset(self, seed=None):
+        self.seed, self.steps = seed, 0
+        return np.full(2, seed, np.float32), {}
+
+    def step(self, action):
+        self.steps += 1
+        reward = float(action.sum()) + self.seed
+        return np.zeros(2, np.float32), reward, False, self.steps == 3, {}
+
+    def close(self):
+        pass
+
+
+class Fatal(Env):
+    """Kills its process in episode 1 (seed 11): as often as the file says."""
+
+    def step(self, action):
+        left = int(MARK.read_text())
+        if self.seed == 11 and left > 0:
+            MARK.write_text(str(left - 1))
+            os._exit(1)
+        return super().step(action)
+
+
+def half(observation):
+    return np.full(2, 0.5)
+
+
+def big(observation):
+    return np.full(2, 9.0)
+
+
+def nan(observation):
+    return np.full(2, np.nan)
+'''
+
+
+@pytest.fixture
+def dummy(tmp_path, monkeypatch):
+    (tmp_path / "dummy_rollout_env.py").write_text(DUMMY)
+    (tmp_path / "deaths").write_text("0")
+    monkeypatch.syspath_prepend(tmp_path)
+    import dummy_rollout_env as module
+
+    yield module
+    monkeypatch.delitem(__import__("sys").modules, "dummy_rollout_env")
+
+
+def test_mean_policy_equals_actor():
+    torch.manual_seed(0)
+    actor = make_policy(28, 8)
+    with torch.no_grad():
+        for name, value in actor.named_parameters():
+            if value.ndim == 1 and name.endswith("weight"):
+                value.uniform_(0.5, 2.0)
+    observation = torch.randn(5, 28)
+    loc = actor.get_dist(actor.module[0](_td(observation))).base_dist.loc
+    mean = MeanPolicy.from_actor_state(actor.state_dict())(observation.numpy())
+    assert mean.shape == (5, 8)
+    np.testing.assert_allclose(mean, loc.detach().numpy(), rtol=1e-4, atol=1e-5)
+
+
+def _td(observation):
+    from tensordict import TensorDict
+
+    return TensorDict({"observation": observation}, observation.shape[:1])
+
+
+def test_mean_policy_by_hand():
+    # [3, 4] / rms = [3, 4] / sqrt(12.5), times 2; then Squish; the mean is the first output.
+    policy = MeanPolicy([(np.eye(2), np.zeros(2), np.full(2, 2.0)), (np.eye(2), np.ones(2), None)], eps=0.0)
+    x = 2 * 3 / np.sqrt(12.5)
+    np.testing.assert_allclose(policy(np.array([3.0, 4.0])), [x * (1 + x / np.sqrt(x * x + 4)) / 2 + 1], rtol=1e-6)
+
+
+def test_bad_states():
+    with pytest.raises(KeyError, match="no bias"):
+        MeanPolicy.from_actor_state({"0.weight": np.eye(2)})
+    with pytest.raises(ValueError, match="cannot place 'scale'"):
+        MeanPolicy.from_actor_state({"scale": np.ones(2)})
+    with pytest.raises(ValueError, match="even number"):
+        MeanPolicy([(np.eye(3), np.zeros(3), None)])
+
+
+def test_rows_by_hand(dummy):
+    rows = evaluate_policies(
+        {"half": dummy.half, "big": dummy.big}, episodes=2, seed=10, workers=0, env_fn=dummy.Env, progress=False
+    )
+    # three steps of seed + sum(action); 9 is clipped to 1
+    assert rows == [
+        {"policy": "half", "episode": 0, "seed": 10, "return": 33.0, "length": 3},
+        {"policy": "half", "episode": 1, "seed": 11, "return": 36.0, "length": 3},
+        {"policy": "big", "episode": 0, "seed": 10, "return": 36.0, "length": 3},
+        {"policy": "big", "episode": 1, "seed": 11, "return": 39.0, "length": 3},
+    ]
+
+
+def test_failing_policy_is_named(dummy):
+    with pytest.raises(RuntimeError, match=r"policy 'nan', episode 0 \(seed 10\).*finite action"):
+        evaluate_policies({"nan": dummy.nan}, episodes=1, seed=10, workers=0, env_fn=dummy.Env, progress=False)
+
+
+def test_unpicklable_policy_is_named(dummy):
+    with pytest.raises(ValueError, match="'mine' cannot be pickled"):
+        evaluate_policies({"mine": lambda o: o}, episodes=1, workers=1, env_fn=dummy.Env, progress=False)
+
+
+def test_dead_worker_is_replaced(dummy, tmp_path):
+    (tmp_path / "deaths").write_text("1")
+    rows = evaluate_policies(
+        {"half": dummy.half}, episodes=3, seed=10, workers=2, env_fn="dummy_rollout_env:Fatal", progress=False
+    )
+    assert [row["return"] for row in rows] == [33.0, 36.0, 39.0]
+    assert (tmp_path / "deaths").read_text() == "0"
+
+
+def test_worker_that_keeps_dying_is_named(dummy, tmp_path):
+    (tmp_path / "deaths").write_text("99")
+    with pytest.raises(RuntimeError, match="died 2 times on 'half' episode 1:"):
+        evaluate_policies(
+            {"half": dummy.half}, episodes=2, seed=10, workers=1, retries=1, env_fn=dummy.Fatal, progress=False
+        )
+    assert (tmp_path / "deaths").read_text() == "97"
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_ant_does_not_depend_on_what_ran_before():
+    pytest.importorskip("pybullet")
+    pytest.importorskip("pybullet_envs_gymnasium")
+    rng = np.random.default_rng(0)
+    policy = MeanPolicy([(rng.normal(size=(16, 28)), rng.normal(size=16), None)])
+    env_fn = "torchrl_tsallis.envs:make_ant"
+    alone = run_episode(policy, env_fn, 3)
+    run_episode(policy, env_fn, 4)
+    assert run_episode(policy, env_fn, 3) == alone
+    assert alone != run_episode(policy, env_fn, 4)

@@ -1,0 +1,24 @@
+"""Evaluation: parallel rollouts, statistics, plots and videos."""
+
+from __future__ import annotations
+
+from torchrl_tsallis.evaluation.mean_policy import MeanPolicy
+from torchrl_tsallis.evaluation.plots import auroc_bars, rating_histogram, return_by_method, schedule
+from torchrl_tsallis.evaluation.rollouts import evaluate_policies
+from torchrl_tsallis.evaluation.statistics import auroc, bootstrap_interval, iqm, median, probability_of_improvement
+from torchrl_tsallis.evaluation.video import record_rollout
+
+__all__ = [
+    "MeanPolicy",
+    "auroc",
+    "auroc_bars",
+    "bootstrap_interval",
+    "evaluate_policies",
+    "iqm",
+    "median",
+    "probability_of_improvement",
+    "rating_histogram",
+    "record_rollout",
+    "return_by_method",
+    "schedule",
+]
