@@ -1,0 +1,147 @@
+"""The noises of section V-A as pure functions of demonstrations, with ground-truth labels kept beside the data.
+
+Demonstrations are a flat TensorDict ``[N]`` with ``observation`` and ``action``, and side entries under ``info`` that
+training never reads: ``episode``, ``expert``, ``is_noise`` and ``is_amateur``, each ``[N]``.
+"""
+
+from __future__ import annotations
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+
+#: Task -> (artificial noise, amateur), section V-A.
+TASKS = {
+    "clean": (False, False),
+    "artificial": (True, False),
+    "amateur": (False, True),
+    "both": (True, True),
+}
+
+
+def add_action_noise(
+    demonstrations: TensorDictBase, *, probability: float = 0.1, mean: float = 5.0, scale: float = 1.0, seed: int = 0
+) -> TensorDict:
+    """Adds N(mean, scale) to every dimension of the action of randomly chosen time steps.
+
+    Args:
+        demonstrations: flat ``[N]``; not changed.
+        probability: chance of a time step to be hit (0.1, section V-A).
+        mean: mean of the noise, in units of the action (5, section V-A).
+        scale: its standard deviation (1, section V-A).
+        seed: of the noise.
+
+    Returns:
+        A copy with the noise, and ``("info", "is_noise")``, ``[N]`` bool, set where it was added.
+
+    Raises:
+        ValueError: if the probability is not in [0, 1] or the scale is negative.
+
+    Examples:
+        >>> data = TensorDict({"action": torch.zeros(4, 2), "info": TensorDict({}, [4])}, [4])
+        >>> noisy = add_action_noise(data, probability=0.5, scale=0.0, seed=1)
+        >>> torch.equal(noisy["action"][:, 0], 5.0 * noisy["info", "is_noise"])
+        True
+    """
+    if not 0 <= probability <= 1 or scale < 0:
+        raise ValueError(f"probability must be in [0, 1] and scale not negative, got {probability=} and {scale=}")
+    generator = torch.Generator().manual_seed(seed)
+    action = demonstrations["action"]
+    hit = torch.rand(action.shape[:1], generator=generator) < probability
+    noise = mean + scale * torch.randn(action.shape, generator=generator, dtype=action.dtype)
+    out = demonstrations.clone()
+    out["action"] = torch.where(hit.unsqueeze(-1), action + noise, action)
+    out["info", "is_noise"] = hit
+    return out
+
+
+def replace_with_amateur(
+    experts: TensorDictBase, amateur: TensorDictBase, *, per_expert: int = 1, seed: int = 0
+) -> TensorDict:
+    """Replaces randomly chosen trajectories of each expert by trajectories of an amateur (section V-A).
+
+    Args:
+        experts: demonstrations ``[N]`` of any number of experts; not changed.
+        amateur: demonstrations ``[M]`` of the amateur, at least ``per_expert`` trajectories for each expert.
+        per_expert: number of trajectories of each expert that are replaced (1, section V-A).
+        seed: of the choice.
+
+    Returns:
+        A copy in which the chosen trajectories are the amateur's, under the replaced ones' ``episode`` and ``expert``,
+        with ``("info", "is_amateur")`` set.
+
+    Raises:
+        ValueError: if there are too few trajectories.
+
+    Examples:
+        >>> def rows(n):
+        ...     info = {"episode": torch.arange(n), "expert": torch.zeros(n, dtype=torch.int64)}
+        ...     info |= {"is_amateur": torch.zeros(n, dtype=torch.bool)}
+        ...     return TensorDict({"action": torch.zeros(n, 1), "info": TensorDict(info, [n])}, [n])
+        >>> replace_with_amateur(rows(4), rows(1))["info", "is_amateur"].sum()
+        tensor(1)
+    """
+    generator = torch.Generator().manual_seed(seed)
+    spare = amateur["info", "episode"].unique().tolist()
+    replaced: dict[int, int] = {}
+    for expert in experts["info", "expert"].unique().tolist():
+        own = experts["info", "episode"][experts["info", "expert"] == expert].unique()
+        if len(own) < per_expert or len(spare) < per_expert:
+            raise ValueError(
+                f"expert {expert} has {len(own)} trajectories and {len(spare)} of the amateur's are left, "
+                f"per_expert={per_expert} of each are needed: record more, or replace fewer"
+            )
+        for index in torch.randperm(len(own), generator=generator)[:per_expert].tolist():
+            replaced[int(own[index])] = spare.pop(0)
+    parts = []
+    for episode in experts["info", "episode"].unique_consecutive().tolist():
+        part = experts[experts["info", "episode"] == episode]
+        if episode in replaced:
+            other = amateur[amateur["info", "episode"] == replaced[episode]].clone()
+            other["info", "is_amateur"] = torch.ones(len(other), dtype=torch.bool)
+            for key in ("episode", "expert"):
+                other["info", key] = part["info", key][:1].expand(len(other)).clone()
+            part = other
+        parts.append(part)
+    return torch.cat(parts)
+
+
+def make_task(
+    task: str,
+    experts: TensorDictBase,
+    amateur: TensorDictBase,
+    *,
+    seed: int = 0,
+    probability: float = 0.1,
+    mean: float = 5.0,
+    scale: float = 1.0,
+) -> TensorDict:
+    """Builds the demonstrations of one of the paper's four tasks.
+
+    Args:
+        task: ``"clean"``, ``"artificial"``, ``"amateur"`` or ``"both"``.
+        experts: the experts' demonstrations, ``[N]``.
+        amateur: the amateur's, ``[M]``.
+        seed: of the corruptions.
+        probability: of the artificial noise.
+        mean: of the artificial noise.
+        scale: of the artificial noise.
+
+    Returns:
+        The demonstrations, ``[N]``.
+
+    Raises:
+        ValueError: if there is no such task.
+
+    Examples:
+        >>> make_task("noisy", TensorDict({}, [1]), TensorDict({}, [1]))
+        Traceback (most recent call last):
+        ...
+        ValueError: no task 'noisy': choose one of clean, artificial, amateur, both
+    """
+    if task not in TASKS:
+        raise ValueError(f"no task {task!r}: choose one of {', '.join(TASKS)}")
+    artificial, with_amateur = TASKS[task]
+    out = replace_with_amateur(experts, amateur, seed=seed) if with_amateur else experts.clone()
+    if artificial:
+        out = add_action_noise(out, probability=probability, mean=mean, scale=scale, seed=seed)
+    return out
