@@ -1,8 +1,27 @@
-"""Demonstrations: corruptions of them, and the buffers that training samples from."""
+"""Demonstrations: recording, storage, corruptions, and the buffers that training samples from."""
 
 from __future__ import annotations
 
 from torchrl_tsallis.data.corruptions import TASKS, add_action_noise, make_task, replace_with_amateur
+from torchrl_tsallis.data.demonstrations import (
+    load_demonstrations,
+    record_trajectory,
+    save_demonstrations,
+    validate_demonstrations,
+)
+from torchrl_tsallis.data.policy import NumpyPolicy, load_policy
 from torchrl_tsallis.data.replay import make_replay_buffer
 
-__all__ = ["TASKS", "add_action_noise", "make_replay_buffer", "make_task", "replace_with_amateur"]
+__all__ = [
+    "TASKS",
+    "NumpyPolicy",
+    "add_action_noise",
+    "load_demonstrations",
+    "load_policy",
+    "make_replay_buffer",
+    "make_task",
+    "record_trajectory",
+    "replace_with_amateur",
+    "save_demonstrations",
+    "validate_demonstrations",
+]

@@ -2,6 +2,22 @@
 
 from __future__ import annotations
 
+from torchrl_tsallis.trainers.checkpoints import resume
+from torchrl_tsallis.trainers.hooks import EvaluationHook
+from torchrl_tsallis.trainers.logging import LoggerGroup, make_logger
+from torchrl_tsallis.trainers.offline import GuardedStepper, OfflineClock, SampleHook, make_offline_trainer
 from torchrl_tsallis.trainers.q_tuner import QTuner, q_objective, q_of_phi
 
-__all__ = ["QTuner", "q_objective", "q_of_phi"]
+__all__ = [
+    "EvaluationHook",
+    "GuardedStepper",
+    "LoggerGroup",
+    "OfflineClock",
+    "QTuner",
+    "SampleHook",
+    "make_logger",
+    "make_offline_trainer",
+    "q_objective",
+    "q_of_phi",
+    "resume",
+]

@@ -1,0 +1,215 @@
+"""Imitation of noisy PyBullet Ant demonstrations (section V): plain BC against this method.
+
+The default run trains BC, q-BC and the proposal on the task with both noises, and evaluates them::
+
+    python recipes/ant_noise.py
+
+Methods, tasks and seeds are overrides, one or a list; ``resume=true`` continues an interrupted run::
+
+    python recipes/ant_noise.py method=q_bc q=0.95 task=artificial seed=3
+    python recipes/ant_noise.py task=[clean,artificial,amateur,both] seed=[0,1,2] resume=true
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import shutil
+import time
+from concurrent.futures import ProcessPoolExecutor, wait
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import hydra
+import torch
+from ant_report import as_markdown, kinds_of, read_returns, save_plots, save_returns, summarise
+from collect_ant import collect_dataset
+from omegaconf import DictConfig, ListConfig, OmegaConf
+from safetensors.torch import load_file, save_file
+from torchrl._utils import logger as torchrl_logger
+from tqdm import tqdm
+
+from torchrl_tsallis import AdaTerm, CATSoftUpdate, QTuner, TsallisBCLoss
+from torchrl_tsallis._io import atomic_path
+from torchrl_tsallis.data import TASKS, make_replay_buffer, make_task, validate_demonstrations
+from torchrl_tsallis.evaluation import MeanPolicy, evaluate_policies, median, record_rollout
+from torchrl_tsallis.modules import make_policy
+from torchrl_tsallis.trainers import LoggerGroup, make_logger, make_offline_trainer, resume
+
+Unit = tuple[str, int, str]  # task, seed, method: one training
+
+
+def as_list(value: Any) -> list[Any]:
+    """One value or a list of them, as a list."""
+    return list(value) if isinstance(value, (list, ListConfig)) else [value]
+
+
+def units_of(cfg: DictConfig) -> list[Unit]:
+    """The trainings that are asked for."""
+    for name, allowed in (("task", TASKS), ("method", cfg.methods)):
+        unknown = [value for value in as_list(cfg[name]) if value not in allowed]
+        if unknown:
+            raise SystemExit(f"no {name} {unknown[0]!r}: choose one or a list of {', '.join(allowed)}")
+    return list(product(as_list(cfg.task), as_list(cfg.seed), as_list(cfg.method)))
+
+
+def folder_of(unit: Unit, cfg: DictConfig) -> Path:
+    """Where a training's files are."""
+    task, seed, method = unit
+    return Path(cfg.output) / task / f"seed_{seed}" / method
+
+
+def demonstrations(cfg: DictConfig, progress: bool = False) -> tuple[Any, Any]:
+    """The recorded demonstrations, from the cache or made now."""
+    data = cfg.data
+    return collect_dataset(
+        data.cache,
+        std=data.std,
+        seed=data.seed,
+        length=data.length,
+        experts=tuple(data.policies[:-1]),
+        amateur=data.policies[-1],
+        workers=cfg.workers,
+        progress=progress,
+    )
+
+
+_QUEUE: Any = None  # a training's process tells of each finished epoch by it
+
+
+def start_worker(queue: Any) -> None:
+    """Prepares a process that trains."""
+    global _QUEUE
+    _QUEUE = queue
+    torch.set_num_threads(1)
+    torchrl_logger.setLevel("ERROR")
+
+
+def unit_logger(unit: Unit, cfg: DictConfig) -> LoggerGroup:
+    """The loggers of a training; opened again, they continue its run."""
+    task, _, method = unit
+    folder = folder_of(unit, cfg)
+    return make_logger(cfg.logger, folder.parent, method, group=f"{task}/{method}", tags=[task, method])
+
+
+def train(unit: Unit, cfg: DictConfig) -> None:
+    """Trains one policy, in a process of its own; leaves policy, ratings and logs in its folder."""
+    task, seed, method = unit
+    folder = folder_of(unit, cfg)
+    torch.manual_seed(seed)
+    settings = dict(cfg.methods[method])
+    tune = settings.pop("tune_q")
+    data = make_task(task, *demonstrations(cfg), seed=seed, **cfg.data.noise)
+    actor = make_policy(data["observation"].shape[1], data["action"].shape[1], **cfg.policy)
+    loss = TsallisBCLoss(actor, **settings, **cfg.loss)
+    logger = unit_logger(unit, cfg)
+    logger.log_hparams({**OmegaConf.to_container(cfg, resolve=True), "task": task, "seed": seed, "method": method})
+    epoch = len(data) // cfg.batch_size
+    trainer = make_offline_trainer(
+        loss,
+        make_replay_buffer(data, batch_size=cfg.batch_size, seed=seed),
+        AdaTerm(loss.parameters(), **cfg.optimizer),
+        steps=cfg.epochs * epoch,
+        updater=CATSoftUpdate(loss, **cfg.updater) if loss.needs_target else None,
+        tuner=QTuner(loss, **cfg.tuner) if tune else None,
+        logger=logger,
+        log_every=epoch,
+        checkpoint_dir=folder / "checkpoints",
+        checkpoint_every=cfg.checkpoint_every * epoch,
+        progress=False,  # the main process shows one bar for all of them
+    )
+    trainer.register_op("post_steps", lambda: _QUEUE.put(1))
+    done = resume(trainer) if cfg.resume else 0
+    _QUEUE.put(done // epoch)
+    if done < trainer.total_frames:
+        trainer.train()
+    rating = loss.rating(data)
+    for kind, mask in kinds_of(data).items():
+        logger.log_histogram(f"rating/{kind}", rating[mask], step=trainer.collected_frames)
+    logger.shutdown()
+    with atomic_path(folder / "ratings.safetensors") as path:
+        save_file({"rating": rating, **kinds_of(data)}, path)
+    with atomic_path(folder / "policy.safetensors") as path:  # last: it marks the training as done
+        save_file({name: value.contiguous() for name, value in actor.state_dict().items()}, path)
+
+
+def train_all(units: list[Unit], cfg: DictConfig) -> None:
+    """Trains in worker processes, with one progress bar."""
+    context = multiprocessing.get_context("spawn")
+    queue = context.Queue()
+    with (
+        ProcessPoolExecutor(cfg.workers, context, start_worker, (queue,)) as pool,
+        tqdm(total=len(units) * cfg.epochs, desc="training", unit="epoch", disable=not cfg.progress) as bar,
+    ):
+        waiting = {pool.submit(train, unit, cfg) for unit in units}
+        try:
+            while waiting:
+                finished, waiting = wait(waiting, timeout=0.5)
+                while not queue.empty():
+                    bar.update(queue.get())
+                for future in finished:
+                    future.result()
+        except BaseException:
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise
+
+
+def load_actor(folder: Path) -> MeanPolicy:
+    """The trained policy of a folder, without torch."""
+    state = load_file(folder / "policy.safetensors")
+    layers = sorted(state, key=lambda name: [(part.isdigit(), part.zfill(4)) for part in name.split(".")])
+    return MeanPolicy.from_actor_state({name: state[name] for name in layers})
+
+
+def evaluate(units: list[Unit], cfg: DictConfig) -> None:
+    """Evaluates policies on common seeds; leaves raw returns, and a video of each first seed, in their folders."""
+    for task, seed in dict.fromkeys(unit[:2] for unit in units):
+        folders = {unit[2]: folder_of(unit, cfg) for unit in units if unit[:2] == (task, seed)}
+        policies = {method: load_actor(folder) for method, folder in folders.items()}
+        rows = evaluate_policies(policies, workers=cfg.workers, progress=cfg.progress, **cfg.evaluation)
+        for method, folder in folders.items():
+            own = [{**row, "method": method, "task": task, "seed": seed} for row in rows if row["policy"] == method]
+            logger = unit_logger((task, seed, method), cfg)
+            logger.log_scalar("eval/return_median", median([row["return"] for row in own]))
+            if cfg.video and seed == as_list(cfg.seed)[0]:
+                logger.log_video("eval/video", record_rollout(policies[method], folder / "rollout.gif"))
+            logger.shutdown()
+            save_returns(folder / "returns.csv", own)
+
+
+@hydra.main(version_base="1.3", config_path=".", config_name="ant_noise")
+def main(cfg: DictConfig) -> None:
+    """Records, trains, evaluates and shows."""
+    start = time.monotonic()
+    torchrl_logger.setLevel("ERROR")
+    units = units_of(cfg)
+    folders = {unit: folder_of(unit, cfg) for unit in units}
+    if not cfg.resume:
+        for folder in folders.values():
+            shutil.rmtree(folder, ignore_errors=True)
+    experts, _ = demonstrations(cfg, cfg.progress)
+    validate_demonstrations(experts, action_limit=1.0)
+    try:
+        train_all([unit for unit, folder in folders.items() if not (folder / "policy.safetensors").exists()], cfg)
+        evaluate([unit for unit, folder in folders.items() if not (folder / "returns.csv").exists()], cfg)
+    except KeyboardInterrupt:
+        raise SystemExit("interrupted: the same command with resume=true goes on from the last checkpoint") from None
+    rows = [row for folder in folders.values() for row in read_returns(folder / "returns.csv")]
+    save_returns(cfg.results, rows)
+    table = summarise(rows, Path(cfg.output))
+    text = as_markdown(table)
+    with atomic_path(Path(cfg.output) / "table.md") as path:
+        path.write_text(text, encoding="utf-8")
+    pictures = save_plots(rows, Path(cfg.output))
+    logger = make_logger(cfg.logger, cfg.output, "summary", group="summary")
+    logger.log_table("results", table)
+    for picture in pictures:
+        logger.log_picture(picture.stem, picture)
+    logger.shutdown()
+    print(
+        f"\n{text}\n{(time.monotonic() - start) / 60:.1f} minutes; returns in {cfg.results}, pictures in {cfg.output}"
+    )
+
+
+if __name__ == "__main__":
+    main()
