@@ -11,6 +11,9 @@ from torch import Tensor
 __all__ = ["Segments"]
 
 
+_DENSE = 2**18  # entries of the averaging matrix, 1 MB in float32
+
+
 class Segments:
     """Flat layout of tensors of one data type and device.
 
@@ -49,6 +52,11 @@ class Segments:
         device = tensors[0].device
         self.reciprocals = torch.tensor([1 / max(n, 1) for n in lengths], dtype=torch.float64, device=device)
         self.ids = torch.repeat_interleave(torch.tensor(lengths, device=device))
+        # Few segments on the CPU: one product with this matrix costs a third of one sum per tensor.
+        self.averages: Tensor | None = None
+        if device.type == "cpu" and self.num_segments * len(self.ids) <= _DENSE:
+            segments = torch.arange(self.num_segments, device=device).unsqueeze(-1)
+            self.averages = ((segments == self.ids) * self.reciprocals.unsqueeze(-1)).to(tensors[0].dtype)
 
     def flatten(self, tensors: Sequence[Tensor]) -> Tensor:
         """Copies tensors of the layout's shapes into one vector ``[N]``."""
@@ -57,6 +65,11 @@ class Segments:
     def views(self, flat: Tensor) -> list[Tensor]:
         """Views of a vector ``[N]`` in the tensors' shapes ``[*B, *E]``."""
         return [x.view(s) for x, s in zip(flat.split(self.sizes), self.shapes, strict=True)]
+
+    def buffer(self, like: Tensor) -> tuple[Tensor, list[Tensor]]:
+        """An uninitialised vector ``[N]``, and its views in the tensors' shapes."""
+        flat = torch.empty(len(self.ids), dtype=like.dtype, device=like.device)
+        return flat, self.views(flat)
 
     def scalar_views(self, scalars: Tensor) -> list[Tensor]:
         """Views of stacked scalars ``[S]``, of shape ``[*B]`` per tensor."""
@@ -68,6 +81,10 @@ class Segments:
 
     def mean(self, flat: Tensor) -> Tensor:
         """Mean over each segment of a vector ``[N]``, stacked, ``[S]``."""
+        if self.averages is not None and self.averages.dtype == flat.dtype and self.averages.device == flat.device:
+            means = self.averages.mv(flat)
+            if means.isfinite().all():  # else 0 * inf may have carried one segment's trouble to the others
+                return means
         parts = flat.split(self.sizes)
         if self.num_segments == len(parts):  # a full sum costs half of a sum over a dimension
             return torch.stack([x.sum() for x in parts]) * self.reciprocals.to(flat.dtype)

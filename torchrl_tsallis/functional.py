@@ -189,8 +189,10 @@ def tsallis_nll(log_prob: Tensor, log_reference: float | Tensor, q: float | Tens
         >>> tsallis_nll(torch.tensor([-3.0, 0.5]), 0.0, 1.0)
         tensor([ 3.0000, -0.5000])
     """
-    reference = _like(log_reference, log_prob).detach()
-    return ln_q(-reference, q) - ln_q(log_prob - reference, q)
+    reference, q = _like(log_reference, log_prob).detach(), _like(q, log_prob)
+    # Without a gradient the plain formula will do; an autograd Function costs four times as much.
+    constant = ln_q(-reference, q) if q.requires_grad else _LnQ.forward(-reference, q)
+    return constant - ln_q(log_prob - reference, q)
 
 
 def density_moment(log_prob: Tensor, q: float | Tensor, dim: int = -1) -> Tensor:

@@ -12,7 +12,7 @@ from torch.autograd import gradcheck
 
 from torchrl_tsallis import QTuner, TsallisBCLoss
 from torchrl_tsallis.modules import make_policy
-from torchrl_tsallis.trainers import q_objective, q_of_phi
+from torchrl_tsallis.trainers import q_gradient, q_objective, q_of_phi
 
 
 def make_loss(gamma_mix: float | str = 0.0) -> TsallisBCLoss:
@@ -63,6 +63,19 @@ def test_gradcheck_and_limits():
     phi = torch.tensor(0.3, dtype=torch.float64, requires_grad=True)
     assert gradcheck(lambda p: q_objective(log_prob, p), (phi,))
     torch.testing.assert_close(q_of_phi(torch.tensor([-40.0, 0.0, 40.0]), 0.6), torch.tensor([0.6, 0.8, 1.0]))
+
+
+@pytest.mark.parametrize("shift", [-1e4, -50.0, -2.0, -0.1, 0.4, 3.0, 60.0])
+@pytest.mark.parametrize("gamma", [None, 0.0, 0.5])
+def test_written_out_gradient_is_autograds(shift, gamma):
+    log_prob = shift + torch.linspace(-0.5, 0.5, 24, dtype=torch.float64).reshape(2, 12)
+    phi = torch.tensor([-0.7, 1.2], dtype=torch.float64, requires_grad=True)
+    expected = q_objective(log_prob, phi, gamma=gamma)
+    expected.sum().backward()
+    value, slope = q_gradient(log_prob, phi, gamma=gamma)
+    torch.testing.assert_close(value, expected.detach(), rtol=1e-12, atol=0)
+    torch.testing.assert_close(slope, phi.grad, rtol=1e-10, atol=1e-300)
+    assert not slope.requires_grad
 
 
 @pytest.mark.parametrize(("log_prob", "direction"), [(-2.0, -1), (5.0, 1)])

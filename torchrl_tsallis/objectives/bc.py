@@ -229,7 +229,7 @@ class TsallisBCLoss(LossModule):
             if self.needs_target:
                 _, target_log_prob = self._dist_log_prob(inputs, self.target_actor_network_params)
             density = rating(detached, 0.0, self.q)
-            moment = self._reduce_loss(density, tensordict, reduction="mean")
+            moment = density.mean() if mask is None else density[mask].mean()
             reference = self.reference(dist, target_log_prob, moment)
         return log_prob, reference.log_density, reference.gamma_mix, moment, mask
 
@@ -267,7 +267,7 @@ class TsallisBCLoss(LossModule):
             out["q"] = self.q.clone()
             out["gamma_mix"] = gamma
             out |= rating_statistics(rating(detached, log_reference, self.q), mask)
-            out["log_prob"] = self._reduce_loss(detached, tensordict, reduction="mean")
+            out["log_prob"] = detached.mean() if mask is None else detached[mask].mean()
             out["bound"] = bound_ratio(moment, gamma=gamma)
         td_out = TensorDict(out, [])
         self._clear_weakrefs(tensordict, td_out, "actor_network_params", "target_actor_network_params")

@@ -103,7 +103,7 @@ class CATSoftUpdate(TargetNetUpdater):
         for name, source in self._sources.items() if self._active else ():
             group = self._cat[f"target_{name}"]
             target = self._targets.get(f"target_{name}")
-            group.step(self, [source.get(k).data for k in group.keys], [target.get(k).data for k in group.keys])
+            group.step(self, group.leaves(source), group.leaves(target))
 
     def state_dict(self) -> dict[str, Any]:
         """Copy of the complete state: ``cat/<target group>/<scale|nu|started>/<dotted key>``."""
@@ -129,6 +129,7 @@ class _Group:
         leaves = [target.get(k).data for k in self.keys]
         self.segments = Segments(leaves, target.batch_dims)
         flat, eps = self.segments.flatten(leaves), updater.eps
+        self.waiting = True  # for the first difference of some tensor
         count, first = self.segments.num_segments, updater.init_scale == "first"
         self.state = {
             "scale": torch.full_like(flat, eps**2),
@@ -136,29 +137,41 @@ class _Group:
             "started": flat.new_full((count,), 0.0 if first else 1.0),
         }
 
+    def leaves(self, params: Any) -> list[Tensor]:
+        """The tensors of a source or target, in the order of the keys."""
+        return [params.get(k).data for k in self.keys]
+
+    def _start_scale(self, d2: Tensor, eps: float) -> None:
+        """Starts the scale of each tensor at its first squared difference that is not 0."""
+        seg, v, started = self.segments, self.state["scale"], self.state["started"]
+        first = seg.mean(d2)
+        fresh = (started == 0) & (first > 0)
+        v.copy_(torch.where(seg.expand(fresh), seg.expand(first.clamp(eps**2, torch.finfo(v.dtype).max / 16)), v))
+        started.masked_fill_(fresh, 1.0)
+        self.waiting = not bool(started.all())
+
     def step(self, updater: CATSoftUpdate, source: list[Tensor], target: list[Tensor]) -> None:
         """One update, in place of both lists."""
         seg, eps, tau = self.segments, updater.eps, updater.tau
-        old, d = seg.flatten(target), seg.flatten(source)
-        d.sub_(old)
+        d = seg.flatten(source).sub_(seg.flatten(target))
         if self.state["scale"].dtype != d.dtype or self.state["scale"].device != d.device:
             self.state = {name: x.to(d) for name, x in self.state.items()}
             seg.ids = seg.ids.to(d.device)
-        v, nu, started = (self.state[name] for name in ("scale", "nu", "started"))
+        v, nu = self.state["scale"], self.state["nu"]
         d2 = d.square().clamp_(max=torch.finfo(d.dtype).max / 16)
-        if updater.init_scale == "first":
-            first = seg.mean(d2)
-            fresh = (started == 0) & (first > 0)
-            v.copy_(torch.where(seg.expand(fresh), seg.expand(first.clamp(eps**2, torch.finfo(d.dtype).max / 16)), v))
-            started.masked_fill_(fresh, 1.0)
+        if self.waiting:
+            self._start_scale(d2, eps)
         distance = seg.mean(d2 / v)
         share, new_nu = robust_rate(distance, nu, tau, updater.k, eps)
         floor = floor_target(d2, v, seg.expand(distance), seg.expand(nu.reciprocal()), eps)
-        v.addcmul_(seg.expand(share), d2.add_(floor).sub_(v), value=tau)
+        share_flat = seg.expand(share)
+        v.addcmul_(share_flat, d2.add_(floor).sub_(v), value=tau)
         nu.copy_(new_nu)
-        torch._foreach_add_(target, seg.views(seg.expand(tau * share) * d))
-        if updater.strength:
-            torch._foreach_sub_(source, seg.views(seg.expand(updater.strength * tau * (1 - share)) * d))
+        followed = share_flat.mul_(tau).mul_(d)
+        torch._foreach_add_(target, seg.views(followed))
+        if updater.strength:  # strength (tau - t) d, by what was not followed
+            refused = d.mul_(tau).sub_(followed).mul_(updater.strength)
+            torch._foreach_sub_(source, seg.views(refused))
 
     def views(self, name: str) -> dict[str, Tensor]:
         """Views of one entry of the state by dotted key."""
@@ -183,3 +196,4 @@ class _Group:
                     )
                 if not check_only:
                     x.copy_(value)
+        self.waiting = True

@@ -177,6 +177,9 @@ class _Layout:
         self.segments = Segments(params, group["batch_dims"])
         self.flat: dict[str, Tensor] = {}
         self.limit = torch.finfo(params[0].dtype).max / 16
+        self.grad, self.grad_views = self.segments.buffer(params[0])
+        self.update, self.update_views = self.segments.buffer(params[0])
+        self.zero = params[0].new_zeros(())
         dof = group["k"] + group["eps"] if group["ini_dof"] is None else group["ini_dof"]
         scalars = {"step": 0.0, "nu": dof, "skipped": 0.0}
         scalars |= {"bias1": 0.0, "bias2": 0.0} if group["adaptive_bias"] else {}
@@ -198,7 +201,8 @@ class _Layout:
         """One update of the parameters from their gradients."""
         seg, f, (beta1, beta2, beta_nu), eps = self.segments, self.flat, group["betas"], group["eps"]
         m, s, floor, nu = f["exp_avg"], f["exp_avg_sq"], f["floor"], f["nu"]
-        d = seg.flatten([p.grad for p in params if p.grad is not None])
+        d = self.grad
+        torch._foreach_copy_(self.grad_views, [p.grad for p in params if p.grad is not None])
         if group["weight_decay"]:
             d.add_(seg.flatten(params), alpha=group["weight_decay"])
         d.sub_(m)
@@ -206,15 +210,17 @@ class _Layout:
         v = s + floor
         ratio = d2 / v
         if group["skip_nonfinite"]:
-            ratio.add_(d * 0)  # NaN where the gradient is not finite; d2 was clamped and no longer shows it
+            ratio.addcmul_(d, self.zero)  # NaN where the gradient is not finite; d2 was clamped and no longer shows it
         distance = seg.mean(ratio)
-        if group["skip_nonfinite"]:
-            bad = distance.isnan()
+        bad = distance.isnan() if group["skip_nonfinite"] else None
+        if bad is not None and bad.device.type == "cpu" and not bad.any():
+            bad = None  # reading it back costs nothing on a CPU, and would stall a GPU
+        if bad is not None:
             distance = distance.masked_fill(bad, 0.0)
             d.nan_to_num_(0.0, 0.0, 0.0)
             d2.nan_to_num_(0.0)
         share, new_nu = robust_rate(distance, nu, 1 - beta_nu, group["k"], eps)
-        if group["skip_nonfinite"]:
+        if bad is not None:
             share, new_nu = share.masked_fill(bad, 0.0), torch.where(bad, nu, new_nu)
             f["skipped"].add_(bad)
             f["step"].add_(~bad)
@@ -226,20 +232,20 @@ class _Layout:
         s.addcmul_(share_flat, d2.sub_(s), value=1 - beta2)
         floor.addcmul_(share_flat, de.sub_(floor), value=1 - beta2)
         nu.copy_(new_nu)
-        v = s + floor
+        v = torch.add(s, floor, out=v)
         if group["uncentered"]:
             v.addcmul_(m, m).clamp_(max=self.limit)
         if group["amsgrad"]:
             largest = f["max_exp_avg_sq"]
             v = torch.maximum(largest * group["amsgrad"], v)
-            if group["skip_nonfinite"]:
+            if bad is not None:
                 v = torch.where(seg.expand(bad), largest, v)
             largest.copy_(v)
         scale = self._bias_correction(group, share, beta1, beta2) * group["lr"]
-        if group["skip_nonfinite"]:
+        if bad is not None:
             scale, v = scale.masked_fill(bad, 0.0), v.clamp_(min=torch.finfo(v.dtype).tiny)
-        update = seg.views(seg.expand(scale) * m / v.sqrt_())
-        torch._foreach_sub_(params, update)
+        torch.mul(seg.expand(scale), m, out=self.update).div_(v.sqrt_())
+        torch._foreach_sub_(params, self.update_views)
 
     def _bias_correction(self, group: dict[str, Any], share: Tensor, beta1: float, beta2: float) -> Tensor:
         """Returns ``sqrt(c2) / c1`` for the corrections c1, c2 of the two moments, ``[S]``."""
@@ -249,5 +255,8 @@ class _Layout:
             c1.add_((1 - beta1) * share * (1 - c1))
             c2.add_((1 - beta2) * share * (1 - c2))
             return c2.sqrt() / c1.clamp(min=tiny)
-        c1, c2 = (-torch.expm1(f["step"] * math.log(max(b, tiny))) for b in (beta1, beta2))
+        c2 = -torch.expm1(f["step"] * math.log(max(beta2, tiny)))
+        if beta1 == beta2:
+            return c2.clamp_(min=tiny).rsqrt_()
+        c1 = -torch.expm1(f["step"] * math.log(max(beta1, tiny)))
         return c2.sqrt() / c1.clamp(min=tiny)

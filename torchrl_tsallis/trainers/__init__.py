@@ -6,7 +6,7 @@ from torchrl_tsallis.trainers.checkpoints import resume
 from torchrl_tsallis.trainers.hooks import EvaluationHook
 from torchrl_tsallis.trainers.logging import LoggerGroup, make_logger
 from torchrl_tsallis.trainers.offline import GuardedStepper, OfflineClock, SampleHook, make_offline_trainer
-from torchrl_tsallis.trainers.q_tuner import QTuner, q_objective, q_of_phi
+from torchrl_tsallis.trainers.q_tuner import QTuner, q_gradient, q_objective, q_of_phi
 
 __all__ = [
     "EvaluationHook",
@@ -17,6 +17,7 @@ __all__ = [
     "SampleHook",
     "make_logger",
     "make_offline_trainer",
+    "q_gradient",
     "q_objective",
     "q_of_phi",
     "resume",

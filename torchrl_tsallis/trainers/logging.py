@@ -86,7 +86,7 @@ class LoggerGroup(Logger):
             if type(logger).__name__ == "WandbLogger":
                 import wandb
 
-                table = wandb.Table(columns=columns, data=[[row[c] for c in columns] for row in rows])
+                table = wandb.Table(columns=[*columns], data=[[row[c] for c in columns] for row in rows])
                 logger.experiment.log({name: table})
             else:
                 lines = [columns, ["---"] * len(columns), *([str(row[c]) for c in columns] for row in rows)]
