@@ -22,7 +22,7 @@ from typing import Any
 
 import hydra
 import torch
-from ant_report import as_markdown, kinds_of, read_returns, save_plots, save_returns, summarise
+from ant_report import kinds_of, read_returns, report, save_returns
 from collect_ant import collect_dataset
 from omegaconf import DictConfig, ListConfig, OmegaConf
 from safetensors.torch import load_file, save_file
@@ -154,18 +154,12 @@ def train_all(units: list[Unit], cfg: DictConfig) -> None:
             raise
 
 
-def load_actor(folder: Path) -> MeanPolicy:
-    """The trained policy of a folder, without torch."""
-    state = load_file(folder / "policy.safetensors")
-    layers = sorted(state, key=lambda name: [(part.isdigit(), part.zfill(4)) for part in name.split(".")])
-    return MeanPolicy.from_actor_state({name: state[name] for name in layers})
-
-
 def evaluate(units: list[Unit], cfg: DictConfig) -> None:
     """Evaluates policies on common seeds; leaves raw returns, and a video of each first seed, in their folders."""
     for task, seed in dict.fromkeys(unit[:2] for unit in units):
         folders = {unit[2]: folder_of(unit, cfg) for unit in units if unit[:2] == (task, seed)}
-        policies = {method: load_actor(folder) for method, folder in folders.items()}
+        states = {method: load_file(folder / "policy.safetensors") for method, folder in folders.items()}
+        policies = {method: MeanPolicy.from_actor_state(state) for method, state in states.items()}
         rows = evaluate_policies(policies, workers=cfg.workers, progress=cfg.progress, **cfg.evaluation)
         for method, folder in folders.items():
             own = [{**row, "method": method, "task": task, "seed": seed} for row in rows if row["policy"] == method]
@@ -196,19 +190,9 @@ def main(cfg: DictConfig) -> None:
         raise SystemExit("interrupted: the same command with resume=true goes on from the last checkpoint") from None
     rows = [row for folder in folders.values() for row in read_returns(folder / "returns.csv")]
     save_returns(cfg.results, rows)
-    table = summarise(rows, Path(cfg.output))
-    text = as_markdown(table)
-    with atomic_path(Path(cfg.output) / "table.md") as path:
-        path.write_text(text, encoding="utf-8")
-    pictures = save_plots(rows, Path(cfg.output))
-    logger = make_logger(cfg.logger, cfg.output, "summary", group="summary")
-    logger.log_table("results", table)
-    for picture in pictures:
-        logger.log_picture(picture.stem, picture)
-    logger.shutdown()
-    print(
-        f"\n{text}\n{(time.monotonic() - start) / 60:.1f} minutes; returns in {cfg.results}, pictures in {cfg.output}"
-    )
+    text = report(rows, Path(cfg.output), cfg.logger)
+    minutes = (time.monotonic() - start) / 60
+    print(f"\n{text}\n{minutes:.1f} minutes; returns in {cfg.results}, pictures in {cfg.output}")
 
 
 if __name__ == "__main__":

@@ -22,6 +22,7 @@ from torchrl_tsallis.evaluation import (
     return_by_method,
     schedule,
 )
+from torchrl_tsallis.trainers import make_logger
 
 COLUMNS = ("method", "task", "seed", "episode", "return")
 
@@ -125,3 +126,17 @@ def save_plots(rows: Sequence[Mapping[str, Any]], output: Path) -> list[Path]:
                 name = output / f"rating_{task}_{method}.png"
                 paths.append(rating_histogram(ratings, name, title=f"{method}, task '{task}', seed {first}"))
     return paths
+
+
+def report(rows: Sequence[Mapping[str, Any]], output: Path, kind: str) -> str:
+    """Writes ``table.md`` and the pictures, logs them as a run named summary, and returns the table's text."""
+    table = summarise(rows, output)
+    text = as_markdown(table)
+    with atomic_path(output / "table.md") as path:
+        path.write_text(text, encoding="utf-8")
+    logger = make_logger(kind, output, "summary", group="summary")
+    logger.log_table("results", table)
+    for picture in save_plots(rows, output):
+        logger.log_picture(picture.stem, picture)
+    logger.shutdown()
+    return text

@@ -46,7 +46,8 @@ class MeanPolicy:
         """Reads an actor's ``state_dict``: a 2-d ``weight`` is a linear layer, a 1-d one is its RMSNorm.
 
         Args:
-            state: tensors or arrays by key, in the network's order; keys end in ``weight`` or ``bias``.
+            state: tensors or arrays by key, in any order; keys end in ``weight`` or ``bias``, and their numbers are the
+                layers' order, as in ``torch.nn.Sequential``.
             eps: RMSNorm's epsilon (default as in the class).
 
         Returns:
@@ -63,10 +64,10 @@ class MeanPolicy:
             array([0.], dtype=float32)
         """
         layers: list[tuple[np.ndarray, np.ndarray, np.ndarray | None]] = []
-        for key, value in state.items():
+        for key in sorted(state, key=lambda name: [(part.isdigit(), part.zfill(4)) for part in name.split(".")]):
             if key.endswith("bias"):
                 continue
-            array = _array(value)
+            array = _array(state[key])
             if key.endswith("weight") and array.ndim == 2:
                 bias = state.get(key[: -len("weight")] + "bias")
                 if bias is None:
