@@ -1,4 +1,4 @@
-"""Soft actor-critic for recipes/train_experts.py: TorchRL's loss, and the same written out for speed."""
+"""Soft actor-critic for recipes/train_experts.py: TorchRL's loss, the same written out for speed, and its policy."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable
 from typing import Any
 
+import numpy as np
 import torch
 from omegaconf import DictConfig
 from tensordict.nn import ProbabilisticTensorDictModule, ProbabilisticTensorDictSequential, TensorDictModule
@@ -86,3 +87,27 @@ def written_out(loss: SACLoss, gamma: float, target_entropy: float) -> Callable[
         return loss_qvalue + (alpha * log_prob - new_value).mean() + loss_alpha
 
     return losses
+
+
+def export_policy(net: MLP) -> dict[str, torch.Tensor]:
+    """Return the actor as plain tensors: ``x @ w1 + b1``, ReLU, and so on."""
+    tensors = {}
+    for i, layer in enumerate((m for m in net.modules() if isinstance(m, nn.Linear)), start=1):
+        tensors[f"w{i}"] = layer.weight.detach().t().contiguous().clone()
+        tensors[f"b{i}"] = layer.bias.detach().clone()
+    return tensors
+
+
+def numpy_policy(tensors: dict[str, torch.Tensor]) -> Callable[..., np.ndarray]:
+    """Return the exported policy in NumPy, several times faster for one observation."""
+    w1, b1, w2, b2, w3, b3 = (tensors[k].numpy() for k in ("w1", "b1", "w2", "b2", "w3", "b3"))
+
+    def policy(obs: np.ndarray, rng: np.random.Generator | None = None) -> np.ndarray:
+        out = np.maximum(np.maximum(obs @ w1 + b1, 0.0) @ w2 + b2, 0.0) @ w3 + b3
+        loc, log_std = np.split(out, 2)
+        if rng is not None:  # a sample, else the mode
+            std = np.exp(np.clip(log_std, LOG_STD_MIN, LOG_STD_MAX))
+            loc = loc + std * rng.standard_normal(loc.shape, dtype=np.float32)
+        return np.tanh(loc)
+
+    return policy

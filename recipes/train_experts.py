@@ -25,43 +25,17 @@ import numpy as np
 import pybullet_envs_gymnasium  # noqa: F401
 import torch
 from omegaconf import DictConfig
-from sac import LOG_STD_MAX, LOG_STD_MIN, make_loss, written_out
+from sac import export_policy, make_loss, numpy_policy, written_out
 from safetensors import safe_open
 from safetensors.torch import save_file
 from tensordict import TensorDict
-from torch import nn
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
-from torchrl.modules import MLP
 from torchrl.objectives import SoftUpdate
 from tqdm import tqdm
 
 from torchrl_tsallis._io import atomic_path
 
 KEYS = ["observation", "action", ("next", "observation"), ("next", "reward"), ("next", "terminated")]
-
-
-def export_policy(net: MLP) -> dict[str, torch.Tensor]:
-    """Return the actor as plain tensors: ``x @ w1 + b1``, ReLU, and so on."""
-    tensors = {}
-    for i, layer in enumerate((m for m in net.modules() if isinstance(m, nn.Linear)), start=1):
-        tensors[f"w{i}"] = layer.weight.detach().t().contiguous().clone()
-        tensors[f"b{i}"] = layer.bias.detach().clone()
-    return tensors
-
-
-def numpy_policy(tensors: dict[str, torch.Tensor]) -> Callable[..., np.ndarray]:
-    """Return the exported policy in NumPy, several times faster for one observation."""
-    w1, b1, w2, b2, w3, b3 = (tensors[k].numpy() for k in ("w1", "b1", "w2", "b2", "w3", "b3"))
-
-    def policy(obs: np.ndarray, rng: np.random.Generator | None = None) -> np.ndarray:
-        out = np.maximum(np.maximum(obs @ w1 + b1, 0.0) @ w2 + b2, 0.0) @ w3 + b3
-        loc, log_std = np.split(out, 2)
-        if rng is not None:  # a sample, else the mode
-            std = np.exp(np.clip(log_std, LOG_STD_MIN, LOG_STD_MAX))
-            loc = loc + std * rng.standard_normal(loc.shape, dtype=np.float32)
-        return np.tanh(loc)
-
-    return policy
 
 
 def evaluate(env: gym.Env, policy: Callable, episodes: int, rng: np.random.Generator | None = None) -> np.ndarray:
@@ -185,8 +159,9 @@ Soft actor-critic agents for `{cfg.env_id}`, trained by `recipes/train_experts.p
 `b3`, float32) with its origin as metadata: `action = tanh(out[:8])`, and `out[8:]` is the logarithm of the standard
 deviation before it is clamped to [-20, 2]. The observations are not normalised.
 
-Undiscounted returns of {cfg.card.episodes} episodes of at most 1000 steps, reset with the seeds 10000 and up: mean ± standard
-deviation [lowest, highest], and the mean length. *Stochastic* samples the action, *deterministic* takes its mode.
+Undiscounted returns of {cfg.card.episodes} episodes of at most 1000 steps, reset with the seeds 10000 and up: mean ±
+standard deviation [lowest, highest], and the mean length. *Stochastic* samples the action, *deterministic* takes its
+mode.
 
 | policy | seed | steps | deterministic | length | stochastic | length |
 |---|---|---|---|---|---|---|

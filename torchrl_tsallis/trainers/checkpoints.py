@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import zipfile
 from pathlib import Path
 
@@ -10,6 +11,14 @@ from torchrl.checkpoint import CheckpointError
 from torchrl.trainers import Trainer
 
 _BROKEN = (OSError, ValueError, KeyError, RuntimeError, zipfile.BadZipFile, json.JSONDecodeError)
+
+
+def _reason(error: BaseException) -> str:
+    """The component and the innermost error; the chain between them repeats whole tensordicts."""
+    component = re.findall(r"component '(\w+)'", str(error))[:1]
+    while error.__cause__ or error.__context__:
+        error = error.__cause__ or error.__context__  # type: ignore[assignment]
+    return ", ".join([*component, str(error).split("\n", 1)[0]])
 
 
 def resume(trainer: Trainer) -> int:
@@ -45,8 +54,8 @@ def resume(trainer: Trainer) -> int:
         trainer.load_from_file(path)
     except CheckpointError as error:
         raise RuntimeError(
-            f"{str(path)!r} does not fit this run ({error}): resume with the settings and data that it was made with, "
-            "or choose another output folder"
+            f"{str(path)!r} does not fit this run ({_reason(error)}): resume with the settings and data that it was "
+            "made with, or choose another output folder"
         ) from error
     except _BROKEN as error:
         raise RuntimeError(

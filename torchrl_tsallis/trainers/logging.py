@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import netrc
 import os
+import socket
 import uuid
 import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
+from urllib.parse import urlsplit
 
 import numpy as np
 from torchrl.record.loggers.common import Logger
@@ -173,25 +175,44 @@ def _wandb(root: Path, name: str, settings: dict[str, Any]) -> Logger:
     from torchrl.record.loggers.wandb import WandbLogger
 
     file = root / name / "wandb_id.txt"
+    settings |= {"save_dir": str(root / name), "log_env_packages": False, "reinit": "create_new"}
+    if "WANDB_MODE" not in os.environ:
+        settings["mode"] = "offline" if (reason := _why_offline()) else "online"
+        if reason and reason != "no account":
+            warnings.warn(f"W&B is not reachable ({reason}): logging off-line; use `wandb sync` later", stacklevel=3)
+    try:
+        return WandbLogger(name, id=_wandb_id(file), **settings)
+    except Exception as error:  # wandb raises many kinds for a server that answers, but not as it should
+        warnings.warn(f"W&B refused the run ({error}): logging off-line; use `wandb sync` later", stacklevel=3)
+        file.unlink()  # the refused run goes on holding its id in this process
+        return WandbLogger(name, id=_wandb_id(file), **(settings | {"mode": "offline"}))
+
+
+def _wandb_id(file: Path) -> str:
+    """The run's id, kept in a file so that a resumed run continues it."""
     if not file.exists():
         with atomic_path(file) as temporary:
             temporary.write_text(uuid.uuid4().hex[:8])
-    settings |= {"id": file.read_text(), "save_dir": str(root / name), "log_env_packages": False}
-    settings |= {"reinit": "create_new"}
-    if "WANDB_MODE" not in os.environ:
-        settings["mode"] = "online" if _has_account() else "offline"
+    return file.read_text()
+
+
+def _why_offline() -> str | None:
+    """Why W&B cannot be used online: no account, or a server that does not answer; None if it can."""
+    url = urlsplit(os.environ.get("WANDB_BASE_URL", "https://api.wandb.ai"))
+    host, port = url.hostname or "", url.port or (80 if url.scheme == "http" else 443)
+    if not _has_account(host):
+        return "no account"
     try:
-        return WandbLogger(name, **settings)
-    except Exception as error:  # wandb raises many kinds for a server that does not answer
-        warnings.warn(f"W&B is not reachable ({error}): logging off-line; use `wandb sync` later", stacklevel=3)
-        return WandbLogger(name, **(settings | {"mode": "offline"}))
+        socket.create_connection((host, port), timeout=10).close()
+    except OSError as error:
+        return f"{host}:{port}: {error}"
+    return None
 
 
-def _has_account() -> bool:
+def _has_account(host: str) -> bool:
     """Whether an API key is in the environment or in the netrc file that ``wandb login`` writes."""
     if os.environ.get("WANDB_API_KEY"):
         return True
-    host = os.environ.get("WANDB_BASE_URL", "https://api.wandb.ai").split("//")[-1].split("/")[0]
     try:
         return netrc.netrc().authenticators(host) is not None
     except (OSError, netrc.NetrcParseError):
