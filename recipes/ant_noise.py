@@ -12,10 +12,9 @@ Methods, tasks and seeds are overrides, one or a list; ``resume=true`` continues
 
 from __future__ import annotations
 
-import multiprocessing
 import shutil
 import time
-from concurrent.futures import ProcessPoolExecutor, wait
+from functools import partial
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -24,17 +23,17 @@ import hydra
 import torch
 from ant_report import kinds_of, read_returns, report, save_returns
 from collect_ant import collect_dataset
+from hydra.utils import instantiate
 from omegaconf import DictConfig, ListConfig, OmegaConf
 from safetensors.torch import load_file, save_file
 from torchrl._utils import logger as torchrl_logger
-from tqdm import tqdm
 
-from torchrl_tsallis import AdaTerm, CATSoftUpdate, QTuner, TsallisBCLoss
+import torchrl_tsallis.trainers.configs  # noqa: F401 (registers the groups that the YAML file names)
 from torchrl_tsallis._io import atomic_path
+from torchrl_tsallis._pool import run_jobs, tick
 from torchrl_tsallis.data import TASKS, make_replay_buffer, make_task, validate_demonstrations
 from torchrl_tsallis.evaluation import MeanPolicy, evaluate_policies, median, record_rollout
-from torchrl_tsallis.modules import make_policy
-from torchrl_tsallis.trainers import LoggerGroup, make_logger, make_offline_trainer, resume
+from torchrl_tsallis.trainers import LoggerGroup, make_logger, resume
 
 Unit = tuple[str, int, str]  # task, seed, method: one training
 
@@ -74,17 +73,6 @@ def demonstrations(cfg: DictConfig, progress: bool = False) -> tuple[Any, Any]:
     )
 
 
-_QUEUE: Any = None  # a training's process tells of each finished epoch by it
-
-
-def start_worker(queue: Any) -> None:
-    """Prepares a process that trains."""
-    global _QUEUE
-    _QUEUE = queue
-    torch.set_num_threads(1)
-    torchrl_logger.setLevel("ERROR")
-
-
 def unit_logger(unit: Unit, cfg: DictConfig) -> LoggerGroup:
     """The loggers of a training; opened again, they continue its run."""
     task, _, method = unit
@@ -94,33 +82,34 @@ def unit_logger(unit: Unit, cfg: DictConfig) -> LoggerGroup:
 
 def train(unit: Unit, cfg: DictConfig) -> None:
     """Trains one policy, in a process of its own; leaves policy, ratings and logs in its folder."""
+    torchrl_logger.setLevel("ERROR")
     task, seed, method = unit
     folder = folder_of(unit, cfg)
     torch.manual_seed(seed)
     settings = dict(cfg.methods[method])
     tune = settings.pop("tune_q")
     data = make_task(task, *demonstrations(cfg), seed=seed, **cfg.data.noise)
-    actor = make_policy(data["observation"].shape[1], data["action"].shape[1], **cfg.policy)
-    loss = TsallisBCLoss(actor, **settings, **cfg.loss)
+    actor = instantiate(cfg.policy, obs_dim=data["observation"].shape[1], action_dim=data["action"].shape[1])
+    loss = instantiate(cfg.loss, _partial_=True)(actor_network=actor, **settings)
     logger = unit_logger(unit, cfg)
     logger.log_hparams({**OmegaConf.to_container(cfg, resolve=True), "task": task, "seed": seed, "method": method})
     epoch = len(data) // cfg.batch_size
-    trainer = make_offline_trainer(
-        loss,
-        make_replay_buffer(data, batch_size=cfg.batch_size, seed=seed),
-        AdaTerm(loss.parameters(), **cfg.optimizer),
-        steps=cfg.epochs * epoch,
-        updater=CATSoftUpdate(loss, **cfg.updater) if loss.needs_target else None,
-        tuner=QTuner(loss, **cfg.tuner) if tune else None,
+    trainer = instantiate(cfg.trainer, _partial_=True)(
+        loss=loss,
+        replay_buffer=make_replay_buffer(data, batch_size=cfg.batch_size, seed=seed),
+        optimizer=instantiate(cfg.optimizer),
+        updater=instantiate(cfg.updater),
+        tuner=instantiate(cfg.tuner) if tune else None,
         logger=logger,
+        steps=cfg.epochs * epoch,
         log_every=epoch,
         checkpoint_dir=folder / "checkpoints",
         checkpoint_every=cfg.checkpoint_every * epoch,
         progress=False,  # the main process shows one bar for all of them
     )
-    trainer.register_op("post_steps", lambda: _QUEUE.put(1))
+    trainer.register_op("post_steps", tick)
     done = resume(trainer) if cfg.resume else 0
-    _QUEUE.put(done // epoch)
+    tick(done // epoch)
     if done < trainer.total_frames:
         trainer.train()
     rating = loss.rating(data)
@@ -131,27 +120,6 @@ def train(unit: Unit, cfg: DictConfig) -> None:
         save_file({"rating": rating, **kinds_of(data)}, path)
     with atomic_path(folder / "policy.safetensors") as path:  # last: it marks the training as done
         save_file({name: value.contiguous() for name, value in actor.state_dict().items()}, path)
-
-
-def train_all(units: list[Unit], cfg: DictConfig) -> None:
-    """Trains in worker processes, with one progress bar."""
-    context = multiprocessing.get_context("spawn")
-    queue = context.Queue()
-    with (
-        ProcessPoolExecutor(cfg.workers, context, start_worker, (queue,)) as pool,
-        tqdm(total=len(units) * cfg.epochs, desc="training", unit="epoch", disable=not cfg.progress) as bar,
-    ):
-        waiting = {pool.submit(train, unit, cfg) for unit in units}
-        try:
-            while waiting:
-                finished, waiting = wait(waiting, timeout=0.5)
-                while not queue.empty():
-                    bar.update(queue.get())
-                for future in finished:
-                    future.result()
-        except BaseException:
-            pool.shutdown(wait=False, cancel_futures=True)
-            raise
 
 
 def evaluate(units: list[Unit], cfg: DictConfig) -> None:
@@ -184,7 +152,10 @@ def main(cfg: DictConfig) -> None:
     experts, _ = demonstrations(cfg, cfg.progress)
     validate_demonstrations(experts, action_limit=1.0)
     try:
-        train_all([unit for unit, folder in folders.items() if not (folder / "policy.safetensors").exists()], cfg)
+        open_units = [unit for unit, folder in folders.items() if not (folder / "policy.safetensors").exists()]
+        total = len(open_units) * cfg.epochs
+        bar = {"total": total, "desc": "training", "unit": "epoch", "progress": cfg.progress}
+        run_jobs(partial(train, cfg=cfg), open_units, workers=cfg.workers, **bar)
         evaluate([unit for unit, folder in folders.items() if not (folder / "returns.csv").exists()], cfg)
     except KeyboardInterrupt:
         raise SystemExit("interrupted: the same command with resume=true goes on from the last checkpoint") from None

@@ -8,8 +8,6 @@ The main job calls this by itself when its cache is empty::
 from __future__ import annotations
 
 import hashlib
-import multiprocessing
-from concurrent.futures import ProcessPoolExecutor
 from functools import partial
 from pathlib import Path
 
@@ -17,8 +15,8 @@ import hydra
 import torch
 from omegaconf import DictConfig
 from tensordict import TensorDict
-from tqdm import tqdm
 
+from torchrl_tsallis._pool import run_jobs, tick
 from torchrl_tsallis.data import load_demonstrations, load_policy, record_trajectory, save_demonstrations
 from torchrl_tsallis.envs import make_ant
 
@@ -29,10 +27,10 @@ TRAJECTORIES = 10
 def record(job: tuple[str, int, int], std: float, length: int) -> tuple[TensorDict, int]:
     """Records one trajectory, in a worker process."""
     policy, seed, episode = job
-    torch.set_num_threads(1)
     data, discarded = record_trajectory(make_ant, load_policy(policy), std=std, seed=seed, length=length)
     data["info", "episode"].fill_(episode)
     data["info", "expert"].fill_(episode // TRAJECTORIES)
+    tick()
     return data, discarded
 
 
@@ -71,11 +69,9 @@ def collect_dataset(
     if not file.exists():
         jobs = [(experts[i // TRAJECTORIES], 1000 * (seed + 1) + i, i) for i in range(total)]
         jobs += [(amateur, 1000 * (seed + 1) + total + i, total + i) for i in range(len(experts))]
-        context = multiprocessing.get_context("spawn")
-        with ProcessPoolExecutor(workers, mp_context=context) as pool:
-            results = pool.map(partial(record, std=std, length=length), jobs)
-            bar = tqdm(results, total=len(jobs), desc="recording demonstrations", disable=not progress)
-            parts, discarded = zip(*bar, strict=True)
+        bar = {"total": len(jobs), "desc": "recording", "unit": "trajectory", "progress": progress}
+        results = run_jobs(partial(record, std=std, length=length), jobs, workers=workers, **bar)
+        parts, discarded = zip(*results, strict=True)
         facts = {"std": std, "seed": seed, "length": length, "experts": list(experts), "amateur": amateur}
         returns = [round(float(part["info", "ep_return"][0]), 1) for part in parts]
         save_demonstrations(file, torch.cat(parts), facts | {"discarded": sum(discarded), "returns": returns})

@@ -1,0 +1,88 @@
+"""Work in processes of one thread each, with one progress bar that all of them advance."""
+
+from __future__ import annotations
+
+import multiprocessing
+import signal
+from collections.abc import Callable, Sequence
+from concurrent.futures import ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
+from typing import Any, TypeVar
+
+import torch
+
+Job = TypeVar("Job")
+Result = TypeVar("Result")
+
+_QUEUE: Any = None  # of a worker process: how it tells of its progress
+
+
+def tick(count: int = 1) -> None:
+    """Advances the progress bar from within a job; does nothing outside of one."""
+    if _QUEUE is not None:
+        _QUEUE.put(count)
+
+
+def _start(queue: Any) -> None:
+    """Prepares a worker process."""
+    global _QUEUE
+    _QUEUE = queue
+    torch.set_num_threads(1)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all processes of a terminal; the main one decides
+
+
+def run_jobs(
+    function: Callable[[Job], Result],
+    jobs: Sequence[Job],
+    *,
+    workers: int,
+    total: int,
+    desc: str,
+    unit: str,
+    progress: bool = True,
+) -> list[Result]:
+    """Runs a function on every job, in worker processes.
+
+    Args:
+        function: picklable; calls :func:`tick` as it proceeds.
+        jobs: its arguments, picklable.
+        workers: number of processes.
+        total: number of ticks of all jobs.
+        desc: text before the progress bar.
+        unit: what a tick is.
+        progress: whether to show the bar.
+
+    Returns:
+        The results, in the order of the jobs.
+
+    Raises:
+        RuntimeError: if a worker process dies; the message says so. An exception of a job is passed on. The other
+            jobs are stopped in either case, and after Ctrl-C.
+    """
+    from tqdm import tqdm
+
+    context = multiprocessing.get_context("spawn")
+    queue = context.Queue()
+    pool = ProcessPoolExecutor(workers, context, _start, (queue,))
+    with tqdm(total=total, desc=desc, unit=unit, disable=not progress) as bar:
+        futures = [pool.submit(function, job) for job in jobs]
+        waiting = set(futures)
+        try:
+            while waiting:
+                finished, waiting = wait(waiting, timeout=0.2)
+                for future in finished:
+                    future.result()
+                while not queue.empty():
+                    bar.update(queue.get())
+        except BaseException as error:
+            pool.shutdown(wait=False, cancel_futures=True)
+            for process in multiprocessing.active_children():
+                process.terminate()
+            if isinstance(error, BrokenProcessPool):
+                raise RuntimeError(
+                    f"a worker process died while {desc} (killed, or out of memory): try again with fewer workers"
+                ) from error
+            raise
+        bar.update(bar.total - bar.n)
+    pool.shutdown()
+    return [future.result() for future in futures]

@@ -1,0 +1,187 @@
+"""Hydra configurations, in the groups and with the conventions of TorchRL's own.
+
+Importing this module registers them in Hydra's ``ConfigStore`` (needs ``hydra-core``):
+
+======================  ===============  =======================================================
+group                   name             builds
+======================  ===============  =======================================================
+``model``               ``tsallis_bc``   :func:`~torchrl_tsallis.modules.make_policy`
+``loss``                ``tsallis_bc``   :class:`~torchrl_tsallis.TsallisBCLoss`
+``target_net_updater``  ``cat_soft``     :class:`~torchrl_tsallis.CATSoftUpdate`
+``optimizer``           ``adaterm``      :class:`~torchrl_tsallis.AdaTerm`
+``tuner``               ``q_tuner``      :class:`~torchrl_tsallis.QTuner`
+``trainer``             ``offline``      :func:`~torchrl_tsallis.trainers.make_offline_trainer`
+======================  ===============  =======================================================
+
+Every argument is a field with the same default. What needs the loss or its parameters (updater, tuner, optimizer) is
+built as a partial, because a loss that is named twice in a file would be made twice; the trainer completes them::
+
+    defaults:
+      - model@actor: tsallis_bc
+      - loss@loss: tsallis_bc
+      - optimizer@optimizer: adaterm
+      - target_net_updater@updater: cat_soft
+      - tuner@tuner: q_tuner
+      - trainer@trainer: offline
+      - _self_
+    actor: {obs_dim: 28, action_dim: 8}
+    loss: {actor_network: "${actor}"}
+    trainer: {loss: "${loss}", optimizer: "${optimizer}", updater: "${updater}", tuner: "${tuner}", steps: 23400}
+
+``instantiate(cfg.trainer, replay_buffer=buffer).train()`` then trains.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Any
+
+from hydra.core.config_store import ConfigStore
+from omegaconf import MISSING
+from torch import nn
+from torchrl.trainers import Trainer
+from torchrl.trainers.algorithms.configs.common import ConfigBase
+from torchrl.trainers.algorithms.configs.objectives import LossConfig, TargetNetUpdaterConfig
+
+from torchrl_tsallis.objectives import TsallisBCLoss
+from torchrl_tsallis.trainers.offline import make_offline_trainer
+
+
+@dataclass
+class PolicyConfig(ConfigBase):
+    """Configuration of :func:`~torchrl_tsallis.modules.make_policy`."""
+
+    obs_dim: int = MISSING
+    action_dim: int = MISSING
+    hidden: list[int] = field(default_factory=lambda: [100, 100])
+    observation_key: Any = "observation"
+    action_key: Any = "action"
+    _target_: str = "torchrl_tsallis.modules.make_policy"
+    _convert_: str = "all"
+
+    def __post_init__(self) -> None:
+        """Nothing to check: the factory does."""
+
+
+@dataclass
+class TsallisBCLossConfig(LossConfig):
+    """Configuration of :class:`~torchrl_tsallis.TsallisBCLoss`."""
+
+    actor_network: Any = None
+    q: Any = 0.8
+    gamma_mix: Any = "adaptive"
+    gamma_min: float = 0.1
+    gamma_max: float = 0.9
+    reference: Any = None
+    reduction: str | None = None
+    _target_: str = "torchrl_tsallis.trainers.configs.make_loss"
+
+
+@dataclass
+class CATSoftUpdateConfig(TargetNetUpdaterConfig):
+    """Configuration of :class:`~torchrl_tsallis.CATSoftUpdate`, a partial that waits for the loss."""
+
+    tau: float = 0.1
+    strength: float = 1.0
+    eps: float = 1e-5
+    k: float = 1.0
+    init_scale: str = "first"
+    _target_: str = "torchrl_tsallis.CATSoftUpdate"
+
+
+@dataclass
+class AdaTermConfig(ConfigBase):
+    """Configuration of :class:`~torchrl_tsallis.AdaTerm`, a partial that waits for the parameters."""
+
+    lr: float = 1e-3
+    betas: tuple[float, float, float] = (0.9, 0.9, 0.9)
+    eps: float = 1e-5
+    k: float = 1.0
+    weight_decay: float = 0.0
+    amsgrad: float = 0.0
+    uncentered: bool = False
+    adaptive_bias: bool = False
+    ini_dof: float | None = None
+    batch_dims: int = 0
+    skip_nonfinite: bool = True
+    _target_: str = "torchrl_tsallis.AdaTerm"
+    _convert_: str = "all"  # Hydra's own lists would get into the optimizer's checkpoints
+    _partial_: bool = True
+
+    def __post_init__(self) -> None:
+        """Nothing to check: the optimizer does."""
+
+
+@dataclass
+class QTunerConfig(ConfigBase):
+    """Configuration of :class:`~torchrl_tsallis.QTuner`, a partial that waits for the loss."""
+
+    q_min: float = 0.6
+    multiplier: float = 100.0
+    lr: float = 1e-3
+    optimizer: Any = None
+    _target_: str = "torchrl_tsallis.QTuner"
+    _partial_: bool = True
+
+    def __post_init__(self) -> None:
+        """Nothing to check: the tuner does."""
+
+
+@dataclass
+class OfflineTrainerConfig(ConfigBase):
+    """Configuration of :func:`~torchrl_tsallis.trainers.make_offline_trainer`."""
+
+    loss: Any = MISSING
+    replay_buffer: Any = MISSING
+    optimizer: Any = MISSING
+    steps: int = MISSING
+    updater: Any = None
+    tuner: Any = None
+    logger: Any = None
+    log_every: int = 100
+    checkpoint_dir: Any = None
+    checkpoint_every: int = 1000
+    keep_checkpoints: int = 2
+    max_skips: int = 10
+    clip_norm: float | None = None
+    progress: bool = True
+    _target_: str = "torchrl_tsallis.trainers.configs.make_trainer"
+
+    def __post_init__(self) -> None:
+        """Nothing to check: the factory does."""
+
+
+def make_loss(actor_network: Any, **settings: Any) -> TsallisBCLoss:
+    """Builds the loss; the actor may come as a partial, as TorchRL's model configurations give it."""
+    return TsallisBCLoss(actor_network if isinstance(actor_network, nn.Module) else actor_network(), **settings)
+
+
+def make_trainer(
+    loss: TsallisBCLoss, *, optimizer: Any, updater: Any = None, tuner: Any = None, **rest: Any
+) -> Trainer:
+    """Builds the offline trainer, after completing the partials; an updater that the loss does not need is left out."""
+    optimizer = optimizer(loss.parameters()) if isinstance(optimizer, partial) else optimizer
+    tuner = tuner(loss) if isinstance(tuner, partial) else tuner
+    if not loss.needs_target:
+        updater = None
+    elif isinstance(updater, partial):
+        updater = updater(loss)
+    return make_offline_trainer(loss, optimizer=optimizer, updater=updater, tuner=tuner, **rest)
+
+
+def register() -> None:
+    """Stores the configurations in Hydra's ``ConfigStore``."""
+    store = ConfigStore.instance()
+    for group, name, node in (
+        ("model", "tsallis_bc", PolicyConfig),
+        ("loss", "tsallis_bc", TsallisBCLossConfig),
+        ("target_net_updater", "cat_soft", CATSoftUpdateConfig),
+        ("optimizer", "adaterm", AdaTermConfig),
+        ("tuner", "q_tuner", QTunerConfig),
+        ("trainer", "offline", OfflineTrainerConfig),
+    ):
+        store.store(group=group, name=name, node=node)
+
+
+register()
