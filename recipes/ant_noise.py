@@ -66,6 +66,7 @@ def demonstrations(cfg: DictConfig, progress: bool = False) -> tuple[Any, Any]:
         std=data.std,
         seed=data.seed,
         length=data.length,
+        clip=data.clip,
         experts=tuple(data.policies[:-1]),
         amateur=data.policies[-1],
         workers=cfg.workers,
@@ -150,7 +151,7 @@ def main(cfg: DictConfig) -> None:
         for folder in folders.values():
             shutil.rmtree(folder, ignore_errors=True)
     experts, _ = demonstrations(cfg, cfg.progress)
-    validate_demonstrations(experts, action_limit=1.0)
+    validate_demonstrations(experts, action_limit=1.0 if cfg.data.clip else 1.0 + 6.0 * cfg.data.std)
     try:
         open_units = [unit for unit, folder in folders.items() if not (folder / "policy.safetensors").exists()]
         total = len(open_units) * cfg.epochs

@@ -24,10 +24,10 @@ EXPERTS = ("expert_0", "expert_1", "expert_2")
 TRAJECTORIES = 10
 
 
-def record(job: tuple[str, int, int], std: float, length: int) -> tuple[TensorDict, int]:
+def record(job: tuple[str, int, int], std: float, length: int, clip: bool) -> tuple[TensorDict, int]:
     """Records one trajectory, in a worker process."""
     policy, seed, episode = job
-    data, discarded = record_trajectory(make_ant, load_policy(policy), std=std, seed=seed, length=length)
+    data, discarded = record_trajectory(make_ant, load_policy(policy), std=std, seed=seed, length=length, clip=clip)
     data["info", "episode"].fill_(episode)
     data["info", "expert"].fill_(episode // TRAJECTORIES)
     tick()
@@ -40,6 +40,7 @@ def collect_dataset(
     std: float = 0.2,
     seed: int = 0,
     length: int = 999,
+    clip: bool = False,
     experts: tuple[str, ...] = EXPERTS,
     amateur: str = "amateur",
     workers: int = 2,
@@ -52,6 +53,7 @@ def collect_dataset(
         std: standard deviation of the noise on the executed actions.
         seed: of the recording.
         length: pairs a trajectory.
+        clip: whether the noisy commands are clipped to the action space.
         experts: names or files of the experts' policies.
         amateur: name or file of the amateur's policy.
         workers: processes.
@@ -64,15 +66,16 @@ def collect_dataset(
     for name in (*experts, amateur):
         for tensor in load_policy(name).tensors.values():
             digest.update(tensor.tobytes())
-    file = Path(output) / f"ant_std{std:g}_seed{seed}_length{length}_{digest.hexdigest()[:12]}.safetensors"
+    name = f"ant_std{std:g}{'_clipped' if clip else ''}_seed{seed}_length{length}_{digest.hexdigest()[:12]}"
+    file = Path(output) / f"{name}.safetensors"
     total = len(experts) * TRAJECTORIES
     if not file.exists():
         jobs = [(experts[i // TRAJECTORIES], 1000 * (seed + 1) + i, i) for i in range(total)]
         jobs += [(amateur, 1000 * (seed + 1) + total + i, total + i) for i in range(len(experts))]
         bar = {"total": len(jobs), "desc": "recording", "unit": "trajectory", "progress": progress}
-        results = run_jobs(partial(record, std=std, length=length), jobs, workers=workers, **bar)
+        results = run_jobs(partial(record, std=std, length=length, clip=clip), jobs, workers=workers, **bar)
         parts, discarded = zip(*results, strict=True)
-        facts = {"std": std, "seed": seed, "length": length, "experts": list(experts), "amateur": amateur}
+        facts = {"std": std, "seed": seed, "length": length, "clip": clip, "experts": list(experts), "amateur": amateur}
         returns = [round(float(part["info", "ep_return"][0]), 1) for part in parts]
         save_demonstrations(file, torch.cat(parts), facts | {"discarded": sum(discarded), "returns": returns})
     data, _ = load_demonstrations(file)
@@ -82,7 +85,9 @@ def collect_dataset(
 @hydra.main(version_base="1.3", config_path=".", config_name="collect_ant")
 def main(cfg: DictConfig) -> None:
     """Records and says what was recorded."""
-    data = collect_dataset(cfg.output, std=cfg.std, seed=cfg.seed, workers=cfg.workers, progress=cfg.progress)
+    data = collect_dataset(
+        cfg.output, std=cfg.std, seed=cfg.seed, clip=cfg.clip, workers=cfg.workers, progress=cfg.progress
+    )
     for name, part in zip(("experts", "amateur"), data, strict=True):
         returns = part["info", "ep_return"].view(-1, 999)[:, 0]
         print(

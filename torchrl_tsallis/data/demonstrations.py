@@ -22,7 +22,14 @@ LABELS = ("episode", "expert", "ep_return", "reward", "is_noise", "is_amateur")
 
 
 def record_trajectory(
-    make_env: Callable[[], Any], policy: NumpyPolicy, *, std: float, seed: int, length: int = 999, tries: int = 20
+    make_env: Callable[[], Any],
+    policy: NumpyPolicy,
+    *,
+    std: float,
+    seed: int,
+    length: int = 999,
+    clip: bool = False,
+    tries: int = 20,
 ) -> tuple[TensorDict, int]:
     """Rolls a policy out with noisy actions until an episode lasts long enough.
 
@@ -32,10 +39,14 @@ def record_trajectory(
         std: standard deviation of the Gaussian noise on its actions, in units of the action.
         seed: of the environment and the noise.
         length: number of pairs to record.
+        clip: whether actions are clipped to [-1, 1]. Default: False, the command is recorded as it was sampled and the
+            robot saturates it: clipped commands lie on the limits in a share of the samples, where a normal
+            distribution's density has no bound.
         tries: episodes that may end early before this is an error.
 
     Returns:
-        The pairs, ``[length]``, and the number of discarded episodes. The recorded action is the executed one.
+        The pairs, ``[length]``, and the number of discarded episodes. The recorded action is the command
+        that the environment was given.
 
     Raises:
         RuntimeError: if every episode ended early.
@@ -48,7 +59,7 @@ def record_trajectory(
         rows: list[tuple[np.ndarray, np.ndarray, float]] = []
         done = False
         while not done and len(rows) < length:
-            action = policy.act(observation, rng, std)
+            action = policy.act(observation, rng, std, clip)
             following, reward, terminated, truncated, _ = env.step(action)
             rows.append((np.asarray(observation, dtype=np.float32), action, float(reward)))
             observation, done = following, terminated or truncated

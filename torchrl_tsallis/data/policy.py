@@ -54,11 +54,11 @@ class NumpyPolicy:
         x = np.maximum(np.maximum(x @ t["w1"] + t["b1"], 0) @ t["w2"] + t["b2"], 0) @ t["w3"] + t["b3"]
         return np.tanh(x[..., : x.shape[-1] // 2])
 
-    def act(self, observation: np.ndarray, rng: np.random.Generator, std: float) -> np.ndarray:
-        """Action with Gaussian noise of standard deviation ``std``, clipped to [-1, 1], ``[A]``."""
+    def act(self, observation: np.ndarray, rng: np.random.Generator, std: float, clip: bool = False) -> np.ndarray:
+        """Action with Gaussian noise of standard deviation ``std``, ``[A]``; clipped to [-1, 1] on request."""
         action = self(observation)
-        noise = std * rng.standard_normal(action.shape)
-        return np.clip(action + noise, -1, 1).astype(np.float32)
+        action = action + std * rng.standard_normal(action.shape)
+        return (np.clip(action, -1, 1) if clip else action).astype(np.float32)
 
 
 def load_policy(path: str | os.PathLike[str]) -> NumpyPolicy:
