@@ -118,6 +118,35 @@ def test_loss_equals_the_paper_form_and_bc():
     torch.testing.assert_close(F.tsallis_nll(log_prob, reference, 1.0), -log_prob)
 
 
+@pytest.mark.parametrize("q", QS)
+@pytest.mark.parametrize("gamma", [0.0, 0.1, 0.9, 1.0])
+def test_rated_nll_is_the_loss_and_the_rating(q, gamma):
+    log_prob = torch.tensor(LOG_X, dtype=torch.float64, requires_grad=True)
+    reference = F.log_mixture(torch.tensor(LOG_X[::-1], dtype=torch.float64), gamma)
+    loss, weight = F.rated_nll(log_prob, reference, q)
+    (grad,) = torch.autograd.grad(loss.sum(), log_prob)
+    torch.testing.assert_close(loss, F.tsallis_nll(log_prob, reference, q))
+    torch.testing.assert_close(weight, F.rating(log_prob.detach(), reference, q))
+    assert torch.equal(grad, -weight)
+    assert not weight.requires_grad
+
+
+def test_rated_nll_of_an_impossible_action_is_finite():
+    log_prob = torch.tensor([-math.inf, -1.0], requires_grad=True)
+    loss, _ = F.rated_nll(log_prob, 0.0, 0.8)
+    loss.sum().backward()
+    torch.testing.assert_close(loss[0].detach(), torch.tensor(5.0))  # 1 / (1 - q)
+    assert log_prob.grad[0] == 0
+
+
+def test_log_mixture_is_the_same_without_gradient():
+    target = torch.tensor([-math.inf, *LOG_X])
+    for gamma in (0.0, 0.1, 0.9, 1.0):
+        with torch.no_grad():
+            got = F.log_mixture(target, gamma)
+        torch.testing.assert_close(got, F.log_mixture(target, gamma))
+
+
 def test_loss_gradcheck():
     log_prob = torch.tensor([-3.0, 0.0, 2.0], dtype=torch.float64, requires_grad=True)
     reference = torch.tensor([0.1, -0.2, 0.4], dtype=torch.float64)

@@ -52,9 +52,10 @@ class Segments:
         device = tensors[0].device
         self.reciprocals = torch.tensor([1 / max(n, 1) for n in lengths], dtype=torch.float64, device=device)
         self.ids = torch.repeat_interleave(torch.tensor(lengths, device=device))
+        self.single = all(n == 1 for n in lengths)  # a segment is a scalar: nothing to average or to repeat
         # Few segments on the CPU: one product with this matrix costs a third of one sum per tensor.
         self.averages: Tensor | None = None
-        if device.type == "cpu" and self.num_segments * len(self.ids) <= _DENSE:
+        if device.type == "cpu" and not self.single and self.num_segments * len(self.ids) <= _DENSE:
             segments = torch.arange(self.num_segments, device=device).unsqueeze(-1)
             self.averages = ((segments == self.ids) * self.reciprocals.unsqueeze(-1)).to(tensors[0].dtype)
 
@@ -77,13 +78,15 @@ class Segments:
 
     def expand(self, scalars: Tensor) -> Tensor:
         """Repeats stacked scalars ``[S]`` over the entries of their segments, ``[N]``."""
-        return scalars.index_select(0, self.ids)
+        return scalars if self.single else scalars.index_select(0, self.ids)
 
     def mean(self, flat: Tensor) -> Tensor:
         """Mean over each segment of a vector ``[N]``, stacked, ``[S]``."""
+        if self.single:
+            return flat
         if self.averages is not None and self.averages.dtype == flat.dtype and self.averages.device == flat.device:
             means = self.averages.mv(flat)
-            if means.isfinite().all():  # else 0 * inf may have carried one segment's trouble to the others
+            if math.isfinite(means.sum().item()):  # else 0 * inf may have carried one segment's trouble to the others
                 return means
         parts = flat.split(self.sizes)
         if self.num_segments == len(parts):  # a full sum costs half of a sum over a dimension

@@ -14,85 +14,20 @@ import math
 import torch
 from torch import Tensor
 
-__all__ = ["floor_target", "max_weight", "nu_target", "robust_rate", "student_weight", "weight_entropy"]
-
-
-def student_weight(distance: Tensor, nu: Tensor) -> Tensor:
-    r"""Weight of a sample under Student's t, ``w = (nu + 1) / (nu + D)``.
-
-    Args:
-        distance: mean squared normalised distance ``D``, of any shape; infinite is allowed.
-        nu: degrees of freedom, of the same shape.
-
-    Returns:
-        ``w``, of the same shape; at least the smallest normal number, so that its logarithm is finite.
-
-    Examples:
-        >>> student_weight(torch.tensor([0.0, 1.0, 3.0]), torch.ones(3))
-        tensor([2.0000, 1.0000, 0.5000])
-    """
-    return ((nu + 1) / (nu + distance)).clamp(min=torch.finfo(nu.dtype).tiny)
-
-
-def max_weight(nu: Tensor) -> Tensor:
-    """Largest weight, ``w_max = (nu + 1) / nu``, that of distance 0.
-
-    Args:
-        nu: degrees of freedom, of any shape.
-
-    Returns:
-        ``w_max``, of the same shape.
-
-    Examples:
-        >>> max_weight(torch.tensor([1.0, 4.0]))
-        tensor([2.0000, 1.2500])
-    """
-    return (nu + 1) / nu
-
-
-def weight_entropy(weight: Tensor) -> Tensor:
-    r"""``w_nu = w - ln w``, the statistic that drives the degrees of freedom; at least 1, its value at ``w = 1``.
-
-    Args:
-        weight: ``w > 0``, of any shape.
-
-    Returns:
-        ``w_nu``, of the same shape.
-
-    Examples:
-        >>> weight_entropy(torch.ones(1))
-        tensor([1.])
-    """
-    return weight - weight.log()
-
-
-def nu_target(w_nu: Tensor, nu: Tensor, k: float, eps: float) -> Tensor:
-    r"""Value the degrees of freedom move to, ``nu* = ((nu+2)/(nu+1) + nu) / w_nu * (1 - k/nu) + k + eps``.
-
-    Args:
-        w_nu: :func:`weight_entropy` of the weight, of any shape.
-        nu: degrees of freedom, of the same shape.
-        k: their lower bound.
-        eps: margin over the bound.
-
-    Returns:
-        ``nu*``, of the same shape.
-
-    Examples:
-        >>> nu_target(torch.ones(1), torch.full((1,), 2.0), k=1.0, eps=0.0)
-        tensor([2.6667])
-    """
-    return ((nu + 2) / (nu + 1) + nu) / w_nu * (1 - k / nu) + k + eps
+__all__ = ["floor_target", "robust_rate"]
 
 
 def robust_rate(distance: Tensor, nu: Tensor, rate_nu: float, k: float, eps: float) -> tuple[Tensor, Tensor]:
     r"""Share of the moving average's rate that a sample gets, and the next degrees of freedom.
 
-    ``share = w / w_max`` and ``nu += t_nu (nu* - nu)`` with ``t_nu = rate_nu w_nu / w_nu_max`` and
-    ``w_nu_max = max(w_max - ln w_max, -ln(smallest normal number))``.
+    With the weight ``w = (nu + 1) / (nu + D)`` and that of distance 0, ``w_max = (nu + 1) / nu``::
+
+        share = w / w_max;  nu += t_nu (nu* - nu)
+        t_nu = rate_nu w_nu / w_nu_max;  w_nu = w - ln w;  w_nu_max = max(w_max - ln w_max, -ln(smallest normal number))
+        nu* = ((nu+2)/(nu+1) + nu) / w_nu * (1 - k/nu) + k + eps
 
     Args:
-        distance: ``D``, of any shape.
+        distance: mean squared normalised distance ``D``, of any shape; infinite is allowed.
         nu: degrees of freedom, of the same shape.
         rate_nu: rate of the degrees of freedom, in [0, 1].
         k: lower bound of the degrees of freedom; infinite switches the robustness off (share 1, ``nu`` unchanged).
@@ -108,11 +43,15 @@ def robust_rate(distance: Tensor, nu: Tensor, rate_nu: float, k: float, eps: flo
     """
     if math.isinf(k):
         return torch.ones_like(nu), nu
-    weight, largest = student_weight(distance, nu), max_weight(nu)
-    w_nu = weight_entropy(weight)
-    w_nu_max = weight_entropy(largest).clamp(min=-math.log(torch.finfo(nu.dtype).tiny))
-    rate = rate_nu * w_nu / w_nu_max
-    return weight / largest, nu + rate * (nu_target(w_nu, nu, k, eps) - nu)
+    tiny = torch.finfo(nu.dtype).tiny
+    one_more = nu + 1
+    weight = (one_more / (nu + distance)).clamp_(min=tiny)  # its logarithm is finite
+    largest = one_more / nu
+    w_nu = weight - weight.log()
+    w_nu_max = (largest - largest.log()).clamp_(min=-math.log(tiny))
+    # w_nu (nu* - nu), with (nu + 2) / (nu + 1) + nu = (nu + 1) + 1 / (nu + 1)
+    pull = one_more.add_(one_more.reciprocal()).mul_(1 - k / nu).addcmul_(w_nu, (k + eps) - nu)
+    return weight.div_(largest), torch.addcdiv(nu, pull, w_nu_max, value=rate_nu)
 
 
 def floor_target(d2: Tensor, variance: Tensor, distance: Tensor, inverse_nu: Tensor, eps: float) -> Tensor:

@@ -142,6 +142,8 @@ def log_mixture(target_log_prob: Tensor, gamma: float | Tensor) -> Tensor:
         tensor([-0.6931,  0.0000])
     """
     gamma = _like(gamma, target_log_prob)
+    if not torch.is_grad_enabled():  # the limits are right by themselves, their gradients would not be
+        return torch.logaddexp(torch.log1p(-gamma), gamma.log() + target_log_prob)
     inner = (gamma > 0) & (gamma < 1)
     safe = torch.where(inner, gamma, 0.5)  # keeps log(0) out of the branch that is not taken, and of its gradient
     mixed = torch.logaddexp(torch.log1p(-safe), safe.log() + target_log_prob)
@@ -193,6 +195,41 @@ def tsallis_nll(log_prob: Tensor, log_reference: float | Tensor, q: float | Tens
     # Without a gradient the plain formula will do; an autograd Function costs four times as much.
     constant = ln_q(-reference, q) if q.requires_grad else _LnQ.forward(-reference, q)
     return constant - ln_q(log_prob - reference, q)
+
+
+def rated_nll(log_prob: Tensor, log_reference: float | Tensor, q: float | Tensor) -> tuple[Tensor, Tensor]:
+    r"""Loss and rating of every sample, as :func:`tsallis_nll` and :func:`rating` give them, for less than one of them.
+
+    The loss is a surrogate, ``value - rating * (log_prob - log_prob.detach())`` with detached value and rating: its
+    first derivative is exact, there is no second one, and none with respect to q or the reference.
+
+    Args:
+        log_prob: imitator's log-density, ``[*B]``.
+        log_reference: log-density of the reference, ``[*B]`` or a number.
+        q: Tsallis index.
+
+    Returns:
+        The loss, ``[*B]``, whose gradient with respect to ``log_prob`` is minus the rating, and the rating without
+        graph, ``[*B]``.
+
+    Examples:
+        >>> loss, weight = rated_nll(torch.tensor([-10.0, -1.0]), 0.0, 0.8)
+        >>> loss, weight
+        (tensor([4.3233, 0.9063]), tensor([0.1353, 0.8187]))
+    """
+    with torch.no_grad():
+        constant, reference = log_prob.detach(), _like(log_reference, log_prob)
+        u = 1 - _like(q, log_prob)
+        plain = u == 0
+        z = (u * (constant - reference)).clamp(max=MAX_EXPONENT)
+        # ln_q(1 / reference) - ln_q(pi / reference); a reference of 1 has no first part
+        value = (-u * reference).clamp(max=MAX_EXPONENT).expm1() - z.expm1()
+        value = torch.where(plain, -constant, value / torch.where(plain, 1.0, u))
+        weight = z.exp()
+    if not log_prob.requires_grad:
+        return value, weight
+    # An action outside of the distribution's support has -inf - -inf here, and no gradient.
+    return torch.addcmul(value, weight, (log_prob - constant).nan_to_num(0.0, 0.0, 0.0), value=-1), weight
 
 
 def density_moment(log_prob: Tensor, q: float | Tensor, dim: int = -1) -> Tensor:

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import io
 import math
+import pickle
 
 import pytest
 import torch
@@ -123,6 +124,20 @@ def test_state_dict_round_trip_is_exact():
     state["cat"]["target_net_params"]["scale"]["module.0.bias"] = torch.zeros(7)
     with pytest.raises(ValueError, match=r"module.0.bias.*\(7,\).*\(4,\)"):
         resumed.load_state_dict(state)
+
+
+def test_pickled_with_its_loss_it_follows():
+    loss = _Loss(_net())
+    updater = CATSoftUpdate(loss)
+    _move(loss, 0, 0)
+    updater.step()
+    copied, follower = pickle.loads(pickle.dumps((loss, updater)))
+    for a_loss, an_updater in ((loss, updater), (copied, follower)):
+        _move(a_loss, 1, 0)
+        an_updater.step()
+    for name in ("net_params", "target_net_params"):
+        for a, b in zip(_leaves(getattr(loss, name)), _leaves(getattr(copied, name)), strict=True):
+            assert torch.equal(a, b)
 
 
 def test_follows_the_data_type():

@@ -14,7 +14,8 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.modules import set_recurrent_mode
 from torchrl.objectives.common import LossModule
 
-from torchrl_tsallis.functional import bound_ratio, rating, tsallis_nll
+from torchrl_tsallis.functional import bound_ratio, rated_nll, rating
+from torchrl_tsallis.objectives.actor import get_dist
 from torchrl_tsallis.objectives.reference import MixtureReference, ReferenceDensity
 from torchrl_tsallis.objectives.statistics import rating_statistics
 
@@ -197,7 +198,7 @@ class TsallisBCLoss(LossModule):
         self, inputs: TensorDictBase, params: TensorDictParams
     ) -> tuple[torch.distributions.Distribution, Tensor]:
         with params.to_module(self.actor_network, preserve_module_state=False):
-            dist = self.actor_network.get_dist(inputs.copy())
+            dist = get_dist(self.actor_network, inputs)
         action = inputs.get(self.tensor_keys.action)
         if isinstance(dist, CompositeDistribution):
             log_prob = dist.log_prob(inputs)
@@ -258,7 +259,7 @@ class TsallisBCLoss(LossModule):
             A tensordict with the keys of ``out_keys``.
         """
         log_prob, log_reference, gamma, moment, mask = self._rate(tensordict)
-        per_sample = tsallis_nll(log_prob, log_reference, self.q)
+        per_sample, weights = rated_nll(log_prob, log_reference, self.q)
         out = {"loss_tsallis_bc": self._reduce_loss(per_sample, tensordict)}
         with torch.no_grad():
             detached = log_prob.detach()
@@ -266,7 +267,7 @@ class TsallisBCLoss(LossModule):
                 self._last_batch = (detached, mask)
             out["q"] = self.q.clone()
             out["gamma_mix"] = gamma
-            out |= rating_statistics(rating(detached, log_reference, self.q), mask)
+            out |= rating_statistics(weights, mask)
             out["log_prob"] = detached.mean() if mask is None else detached[mask].mean()
             out["bound"] = bound_ratio(moment, gamma=gamma)
         td_out = TensorDict(out, [])

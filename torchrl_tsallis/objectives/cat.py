@@ -95,15 +95,14 @@ class CATSoftUpdate(TargetNetUpdater):
         if not self._active:
             return
         super().init_()
-        self._cat = {name: _Group(self, target) for name, target in self._targets.items()}
+        sources = {f"target_{name}": source for name, source in self._sources.items()}
+        self._cat = {name: _Group(self, sources[name], target) for name, target in self._targets.items()}
 
     @torch.no_grad()
     def step(self) -> None:
         """Updates the targets, and the parameters by the consolidation."""
-        for name, source in self._sources.items() if self._active else ():
-            group = self._cat[f"target_{name}"]
-            target = self._targets.get(f"target_{name}")
-            group.step(self, group.leaves(source), group.leaves(target))
+        for group in self._cat.values():
+            group.step(self)
 
     def state_dict(self) -> dict[str, Any]:
         """Copy of the complete state: ``cat/<target group>/<scale|nu|started>/<dotted key>``."""
@@ -123,12 +122,13 @@ class CATSoftUpdate(TargetNetUpdater):
 class _Group:
     """State of one group of target parameters: flat ``scale``, stacked ``nu`` and ``started``."""
 
-    def __init__(self, updater: CATSoftUpdate, target: Any) -> None:
+    def __init__(self, updater: CATSoftUpdate, source: Any, target: Any) -> None:
         self.keys = sorted(target.keys(True, True), key=str)
         self.names = [k if isinstance(k, str) else ".".join(k) for k in self.keys]
-        leaves = [target.get(k).data for k in self.keys]
-        self.segments = Segments(leaves, target.batch_dims)
-        flat, eps = self.segments.flatten(leaves), updater.eps
+        # Both are locked: their tensors stay these. To look them up each step would cost as much as the update.
+        self.source, self.target = ([params.get(k) for k in self.keys] for params in (source, target))
+        self.segments = Segments(self.target, target.batch_dims)
+        flat, eps = self.segments.flatten(self.target), updater.eps
         self.waiting = True  # for the first difference of some tensor
         count, first = self.segments.num_segments, updater.init_scale == "first"
         self.state = {
@@ -136,10 +136,11 @@ class _Group:
             "nu": flat.new_full((count,), updater.k + eps),
             "started": flat.new_full((count,), 0.0 if first else 1.0),
         }
+        self.buffers: list[tuple[Tensor, list[Tensor]]] = []  # of a step
 
-    def leaves(self, params: Any) -> list[Tensor]:
-        """The tensors of a source or target, in the order of the keys."""
-        return [params.get(k).data for k in self.keys]
+    def __getstate__(self) -> dict[str, Any]:
+        """A pickled view is no view any more: the buffers are made anew."""
+        return {**self.__dict__, "buffers": []}
 
     def _start_scale(self, d2: Tensor, eps: float) -> None:
         """Starts the scale of each tensor at its first squared difference that is not 0."""
@@ -150,13 +151,22 @@ class _Group:
         started.masked_fill_(fresh, 1.0)
         self.waiting = not bool(started.all())
 
-    def step(self, updater: CATSoftUpdate, source: list[Tensor], target: list[Tensor]) -> None:
-        """One update, in place of both lists."""
+    def _prepare(self) -> None:
+        """Makes the buffers, and moves the state to the parameters' data type and device."""
+        like = self.target[0]
+        self.state = {name: x.to(like) for name, x in self.state.items()}
+        self.segments = Segments(self.target, len(self.segments.batch_shapes[0]))
+        self.buffers = [self.segments.buffer(like) for _ in range(2)]
+
+    def step(self, updater: CATSoftUpdate) -> None:
+        """One update, in place of the source and the target."""
+        source, target, scale = self.source, self.target, self.state["scale"]
+        if not self.buffers or scale.dtype != target[0].dtype or scale.device != target[0].device:
+            self._prepare()
         seg, eps, tau = self.segments, updater.eps, updater.tau
-        d = seg.flatten(source).sub_(seg.flatten(target))
-        if self.state["scale"].dtype != d.dtype or self.state["scale"].device != d.device:
-            self.state = {name: x.to(d) for name, x in self.state.items()}
-            seg.ids = seg.ids.to(d.device)
+        (d, d_views), (followed, followed_views) = self.buffers
+        torch._foreach_copy_(d_views, source)
+        torch._foreach_sub_(d_views, target)
         v, nu = self.state["scale"], self.state["nu"]
         d2 = d.square().clamp_(max=torch.finfo(d.dtype).max / 16)
         if self.waiting:
@@ -164,14 +174,14 @@ class _Group:
         distance = seg.mean(d2 / v)
         share, new_nu = robust_rate(distance, nu, tau, updater.k, eps)
         floor = floor_target(d2, v, seg.expand(distance), seg.expand(nu.reciprocal()), eps)
-        share_flat = seg.expand(share)
-        v.addcmul_(share_flat, d2.add_(floor).sub_(v), value=tau)
+        rate = seg.expand(share.mul_(tau))
+        v.addcmul_(rate, d2.add_(floor).sub_(v))
         nu.copy_(new_nu)
-        followed = share_flat.mul_(tau).mul_(d)
-        torch._foreach_add_(target, seg.views(followed))
+        torch.mul(rate, d, out=followed)
+        torch._foreach_add_(target, followed_views)
         if updater.strength:  # strength (tau - t) d, by what was not followed
-            refused = d.mul_(tau).sub_(followed).mul_(updater.strength)
-            torch._foreach_sub_(source, seg.views(refused))
+            d.mul_(tau).sub_(followed)
+            torch._foreach_sub_(source, d_views, alpha=updater.strength)
 
     def views(self, name: str) -> dict[str, Tensor]:
         """Views of one entry of the state by dotted key."""

@@ -212,9 +212,10 @@ class _Layout:
         if group["skip_nonfinite"]:
             ratio.addcmul_(d, self.zero)  # NaN where the gradient is not finite; d2 was clamped and no longer shows it
         distance = seg.mean(ratio)
-        bad = distance.isnan() if group["skip_nonfinite"] else None
-        if bad is not None and bad.device.type == "cpu" and not bad.any():
-            bad = None  # reading it back costs nothing on a CPU, and would stall a GPU
+        bad = None
+        # A sum of squares is NaN if one of them is. To read it back costs nothing on a CPU, and would stall a GPU.
+        if group["skip_nonfinite"] and (distance.device.type != "cpu" or math.isnan(distance.sum().item())):
+            bad = distance.isnan()
         if bad is not None:
             distance = distance.masked_fill(bad, 0.0)
             d.nan_to_num_(0.0, 0.0, 0.0)

@@ -103,19 +103,19 @@ def q_gradient(
     """
     with torch.no_grad():
         share = phi.sigmoid()
-        q = q_min + (1 - q_min) * share
-        exponent = (1 - q).unsqueeze(-1) * log_prob
-        density = exponent.clamp(max=MAX_EXPONENT).exp()
+        u = (1 - share).mul_(1 - q_min)  # 1 - q
+        exponent = u.unsqueeze(-1) * log_prob
+        density = exponent.clamp(max=MAX_EXPONENT).exp_()
         moment = density.mean(-1)
-        slope = -(density * log_prob.where(exponent <= MAX_EXPONENT, 0.0)).mean(-1)
+        slope = -density.mul_(log_prob).where(exponent <= MAX_EXPONENT, 0.0).mean(-1)
         if gamma is None:
             rest = moment.clamp(1 - gamma_max, 1 - gamma_min)  # 1 - gamma
             slope = slope.where(rest != moment, 0.0)
         else:
             rest = torch.as_tensor(1 - gamma, dtype=moment.dtype, device=moment.device)
         excess = moment / rest - 1
-        by_q = 1 + multiplier * excess.sign() * slope / rest
-        return q + multiplier * excess.abs(), by_q * (1 - q_min) * share * (1 - share)
+        by_q = excess.sign().mul_(slope).div_(rest).mul_(multiplier).add_(1)
+        return excess.abs_().mul_(multiplier).add_(1 - u), by_q.mul_(u).mul_(share)
 
 
 class QTuner(TrainerHookBase):
