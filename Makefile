@@ -1,9 +1,13 @@
 # Everything is installed into $(VENV) first; nothing else is needed on the machine but Python >= 3.10.
 PYTHON ?= python3
 VENV ?= .venv
+ARGS ?=
 BIN = $(VENV)/bin
 
-.PHONY: test install
+.PHONY: run test install
+
+run: install
+	$(BIN)/python recipes/ant_noise.py $(ARGS)
 
 test: install
 	$(BIN)/ruff check .

@@ -69,7 +69,8 @@ def test_one_command_gives_table_returns_pictures_and_a_video(unbroken):
     assert "recording: 100%" in err and "training: 100%" in err and "evaluate: 100%" in err
 
 
-def test_an_interrupted_job_goes_on_to_the_same_weights(unbroken, tmp_path):
+@pytest.mark.parametrize("sign", [signal.SIGINT, signal.SIGKILL], ids=["Ctrl-C", "kill"])
+def test_an_interrupted_job_goes_on_to_the_same_weights(unbroken, tmp_path, sign):
     (tmp_path / "outputs").mkdir()
     (tmp_path / "outputs" / "ant_data").symlink_to(unbroken[0] / "outputs" / "ant_data")
     unit = tmp_path / "outputs" / "ant_noise" / "both" / "seed_0" / "proposal"
@@ -77,9 +78,12 @@ def test_an_interrupted_job_goes_on_to_the_same_weights(unbroken, tmp_path):
     deadline = time.monotonic() + 300
     while not list(unit.glob("checkpoints/*")) and process.poll() is None and time.monotonic() < deadline:
         time.sleep(0.05)
-    os.killpg(process.pid, signal.SIGINT)  # as Ctrl-C in a terminal does
+    if sign == signal.SIGINT:
+        os.killpg(process.pid, sign)  # as Ctrl-C in a terminal does
+    else:
+        process.kill()
     _, err = process.communicate(timeout=60)
-    assert process.returncode == 1 and "resume=true" in err, err
+    assert process.returncode == -sign if sign == signal.SIGKILL else "resume=true" in err, err
     assert list(unit.glob("checkpoints/*")) and not (unit / "policy.safetensors").exists()
     assert gone(process.pid), "a worker is left"
     finish(start(tmp_path, "method=proposal", "resume=true"))
