@@ -22,7 +22,6 @@ from pathlib import Path
 import gymnasium as gym
 import hydra
 import numpy as np
-import pybullet_envs_gymnasium  # noqa: F401
 import torch
 from omegaconf import DictConfig
 from sac import LOG_STD_MAX, LOG_STD_MIN, make_loss, written_out
@@ -36,6 +35,7 @@ from torchrl.objectives import SoftUpdate
 from tqdm import tqdm
 
 from torchrl_tsallis._io import atomic_path
+from torchrl_tsallis.envs import register_ant
 
 KEYS = ["observation", "action", ("next", "observation"), ("next", "reward"), ("next", "terminated")]
 
@@ -78,6 +78,7 @@ def evaluate(env: gym.Env, policy: Callable, episodes: int, rng: np.random.Gener
 
 def train(cfg: DictConfig) -> None:
     """Train one agent."""
+    register_ant()
     torch.set_num_threads(1)
     torch.set_flush_denormal(True)
     torch.manual_seed(cfg.seed)
@@ -156,6 +157,7 @@ def train(cfg: DictConfig) -> None:
 
 def card_row(name: str, source: str, cfg: DictConfig) -> str:
     """Copy a policy to where it is shipped, evaluate it, and describe it in a row of the card's table."""
+    register_ant()
     env = gym.make(cfg.env_id, disable_env_checker=True)
     with safe_open(source, "pt") as file:
         tensors, meta = {k: file.get_tensor(k) for k in file.keys()}, dict(file.metadata())  # noqa: SIM118
@@ -185,8 +187,9 @@ Soft actor-critic agents for `{cfg.env_id}`, trained by `recipes/train_experts.p
 `b3`, float32) with its origin as metadata: `action = tanh(out[:8])`, and `out[8:]` is the logarithm of the standard
 deviation before it is clamped to [-20, 2]. The observations are not normalised.
 
-Undiscounted returns of {cfg.card.episodes} episodes of at most 1000 steps, reset with the seeds 10000 and up: mean ± standard
-deviation [lowest, highest], and the mean length. *Stochastic* samples the action, *deterministic* takes its mode.
+Undiscounted returns of {cfg.card.episodes} episodes of at most 1000 steps, reset with the seeds 10000 and up: mean ±
+standard deviation [lowest, highest], and the mean length. *Stochastic* samples the action, *deterministic* takes its
+mode.
 
 | policy | seed | steps | deterministic | length | stochastic | length |
 |---|---|---|---|---|---|---|

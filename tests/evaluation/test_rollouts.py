@@ -149,7 +149,6 @@ def test_worker_that_keeps_dying_is_named(dummy, tmp_path):
 @pytest.mark.filterwarnings("ignore")
 def test_ant_does_not_depend_on_what_ran_before():
     pytest.importorskip("pybullet")
-    pytest.importorskip("pybullet_envs_gymnasium")
     rng = np.random.default_rng(0)
     policy = MeanPolicy([(rng.normal(size=(16, 28)), rng.normal(size=16), None)])
     env_fn = "torchrl_tsallis.envs:make_ant"
