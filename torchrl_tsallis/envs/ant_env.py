@@ -26,13 +26,21 @@ with quiet():
 STEP = 0.0165  # s of simulated time a step
 SUBSTEPS = 4
 TORQUE = 2.5 * 100.0  # N m at action 1: the robot's power times the joints' coefficient
-GOAL = np.array([0.0, 1e3])  # m: y and x of where the robot walks to
+GOAL = 1e3  # m: the robot walks towards (GOAL, 0)
 FALLEN = 0.26  # m: lowest height of the torso's centre; 0.25 is its radius
 START = 0.1  # rad: the joints' initial angles are uniform within it
 FEET = ("front_left_foot", "front_right_foot", "left_back_foot", "right_back_foot")
 NEAR_LIMIT = float(np.float32(0.99))  # of a scaled angle
 ELECTRICITY_COST, STALL_COST, LIMIT_COST = -2.0, -0.1, -0.1
 _sum = np.add.reduce
+
+
+def _mean(v: tuple[float, ...]) -> float:
+    """NumPy's mean of 21 or 22 numbers: its pairwise order of summation, three times as fast as making an array."""
+    total = ((v[0] + v[8]) + (v[1] + v[9])) + ((v[2] + v[10]) + (v[3] + v[11]))
+    total += ((v[4] + v[12]) + (v[5] + v[13])) + ((v[6] + v[14]) + (v[7] + v[15]))
+    total = total + v[16] + v[17] + v[18] + v[19] + v[20]
+    return (total + v[21]) / 22 if len(v) == 22 else total / 21
 
 
 class AntEnv(gymnasium.Env):
@@ -160,8 +168,8 @@ class AntEnv(gymnasium.Env):
         # The order of the parts, and of y and x, decides how the sums are rounded.
         parts[1:1] = (position,)
         parts += self._parts_of_floor
-        x, y, _ = zip(*parts, strict=True)
-        gap = GOAL - _sum(np.array((y, x)), 1) / len(parts)
+        x, y, _ = zip(*parts)  # noqa: B905
+        gap = np.array((0.0 - _mean(y), GOAL - _mean(x)))
         # A dot product and NumPy's trigonometry, not math's, round like the package's.
         self._potential = -math.sqrt(gap.dot(gap)) / STEP
         dy, dx = gap
