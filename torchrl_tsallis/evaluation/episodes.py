@@ -72,7 +72,8 @@ def run_episodes(policy: Policy, envs: Sequence[Any], seeds: Sequence[int]) -> l
 
     Args:
         policy: maps an observation ``[*O]`` to an action ``[*A]``, which is clipped to the action space; if its
-            attribute ``batched`` is true, maps ``[E, *O]`` to ``[E, *A]``.
+            attribute ``batched`` is true, maps ``[E, *O]`` to ``[E, *A]``. It must not remember earlier observations,
+            because episodes take turns.
         envs: at least as many environments as seeds, all alike, from :func:`make_environment`.
         seeds: given to ``reset``.
 
