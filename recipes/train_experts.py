@@ -22,7 +22,6 @@ from pathlib import Path
 import gymnasium as gym
 import hydra
 import numpy as np
-import pybullet_envs_gymnasium  # noqa: F401
 import torch
 from omegaconf import DictConfig
 from sac import export_policy, make_loss, numpy_policy, written_out
@@ -34,6 +33,7 @@ from torchrl.objectives import SoftUpdate
 from tqdm import tqdm
 
 from torchrl_tsallis._io import atomic_path
+from torchrl_tsallis.envs import register_ant
 
 KEYS = ["observation", "action", ("next", "observation"), ("next", "reward"), ("next", "terminated")]
 
@@ -52,6 +52,7 @@ def evaluate(env: gym.Env, policy: Callable, episodes: int, rng: np.random.Gener
 
 def train(cfg: DictConfig) -> None:
     """Train one agent."""
+    register_ant()
     torch.set_num_threads(1)
     torch.set_flush_denormal(True)
     torch.manual_seed(cfg.seed)
@@ -130,6 +131,7 @@ def train(cfg: DictConfig) -> None:
 
 def card_row(name: str, source: str, cfg: DictConfig) -> str:
     """Copy a policy to where it is shipped, evaluate it, and describe it in a row of the card's table."""
+    register_ant()
     env = gym.make(cfg.env_id, disable_env_checker=True)
     with safe_open(source, "pt") as file:
         tensors, meta = {k: file.get_tensor(k) for k in file.keys()}, dict(file.metadata())  # noqa: SIM118

@@ -4,7 +4,9 @@ import numpy as np
 import pytest
 import torch
 
-from torchrl_tsallis.evaluation.rollouts import MeanPolicy, evaluate_policies, run_episode
+from torchrl_tsallis.data import load_policy
+from torchrl_tsallis.evaluation import MeanPolicy, evaluate_policies
+from torchrl_tsallis.evaluation.episodes import run_episode
 from torchrl_tsallis.modules import make_policy
 
 # Written to a module of its own, because a spawned worker must be able to import it.
@@ -43,6 +45,50 @@ class Fatal(Env):
             MARK.write_text(str(left - 1))
             os._exit(1)
         return super().step(action)
+
+
+class Counted(Env):
+    """Counts the environments that are open, and that were ever made."""
+
+    open = made = 0
+
+    def __init__(self):
+        Counted.open += 1
+        Counted.made += 1
+
+    def close(self):
+        Counted.open -= 1
+
+
+class Failing(Env):
+    """Fails in the second step of the episode of seed 11."""
+
+    def step(self, action):
+        if self.seed == 11 and self.steps == 1:
+            raise OSError("unplugged")
+        return super().step(action)
+
+
+def broken():
+    raise OSError("no such robot")
+
+
+class Batched:
+    """Acts on a batch of observations, and remembers the batches' sizes."""
+
+    batched = True
+
+    def __init__(self):
+        self.sizes = []
+
+    def __call__(self, observations):
+        self.sizes.append(len(observations))
+        return np.full((len(observations), 2), 0.5)
+
+
+def picky(observation):
+    assert observation.shape == (2,)
+    return np.full(2, np.nan if observation[0] == 11 else 0.5)
 
 
 def half(observation):
@@ -146,14 +192,48 @@ def test_worker_that_keeps_dying_is_named(dummy, tmp_path):
     assert (tmp_path / "deaths").read_text() == "97"
 
 
-@pytest.mark.filterwarnings("ignore")
-def test_ant_does_not_depend_on_what_ran_before():
-    pytest.importorskip("pybullet")
-    pytest.importorskip("pybullet_envs_gymnasium")
+def test_failing_episode_of_a_group_is_named(dummy):
+    with pytest.raises(RuntimeError, match=r"policy 'half', episode 1 \(seed 11\).*unplugged"):
+        evaluate_policies({"half": dummy.half}, episodes=3, seed=10, workers=0, env_fn=dummy.Failing, progress=False)
+    with pytest.raises(RuntimeError, match=r"policy 'picky', episode 1 \(seed 11\).*step 0: need a finite action"):
+        evaluate_policies({"picky": dummy.picky}, episodes=3, seed=10, workers=0, env_fn=dummy.Env, progress=False)
+    with pytest.raises(RuntimeError, match=r"policy 'half', episode 0 \(seed 10\).*no such robot"):
+        evaluate_policies({"half": dummy.half}, episodes=3, seed=10, workers=0, env_fn=dummy.broken, progress=False)
+
+
+def test_environments_are_used_again_and_closed(dummy):
+    policies = {"half": dummy.half, "batched": dummy.Batched()}
+    rows = evaluate_policies(policies, episodes=21, seed=10, workers=0, env_fn=dummy.Counted, progress=False)
+    # 21 episodes are 3 groups of 7
+    assert (dummy.Counted.made, dummy.Counted.open) == (7, 0)
+    assert policies["batched"].sizes == [7] * 9
+    assert [row["return"] for row in rows] == [3.0 * (1 + seed) for seed in range(10, 31)] * 2
+
+
+def test_action_of_a_row_does_not_depend_on_the_batch():
     rng = np.random.default_rng(0)
-    policy = MeanPolicy([(rng.normal(size=(16, 28)), rng.normal(size=16), None)])
-    env_fn = "torchrl_tsallis.envs:make_ant"
-    alone = run_episode(policy, env_fn, 3)
-    run_episode(policy, env_fn, 4)
-    assert run_episode(policy, env_fn, 3) == alone
-    assert alone != run_episode(policy, env_fn, 4)
+    for width in (1, 2, 7, 33, 100, 256):
+        shapes = [(width, 28), (width, width), (6, width)]
+        layers = [(rng.normal(size=s), rng.normal(size=s[0]), rng.normal(size=s[0])) for s in shapes]
+        policy = MeanPolicy([*layers[:2], (*layers[2][:2], None)])
+        observations = rng.normal(size=(17, 28)).astype(np.float32)
+        alone = np.stack([policy(observation) for observation in observations])
+        for size in (1, 2, 3, 8, 17):
+            np.testing.assert_array_equal(policy(observations[:size]), alone[:size])
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_ant_does_not_depend_on_workers_and_groups(monkeypatch):
+    pytest.importorskip("pybullet")
+    rng = np.random.default_rng(0)
+    layers = [(rng.normal(size=(100, 28)) / 5, np.zeros(100), np.ones(100)), (rng.normal(size=(16, 100)), np.zeros(16))]
+    policies = {"mean": MeanPolicy([layers[0], (*layers[1], None)]), "expert": load_policy("expert_0")}
+    results = []
+    for workers, group in [(0, 8), (0, 1), (2, 2)]:
+        monkeypatch.setattr("torchrl_tsallis.evaluation.rollouts.GROUP", group)
+        results.append(evaluate_policies(policies, episodes=3, workers=workers, progress=False))
+    assert results[0] == results[1] == results[2]
+    assert results[0][0]["return"] != results[0][1]["return"]
+    for row in (results[0][2], results[0][5]):  # the last of each policy, in a fresh environment
+        alone = run_episode(policies[row["policy"]], "torchrl_tsallis.envs:make_ant", row["seed"])
+        assert alone == (row["return"], row["length"])

@@ -21,7 +21,6 @@ def test_bad_arguments():
 def test_gif_frames_and_size(tmp_path):
     image = pytest.importorskip("PIL.Image")
     pytest.importorskip("pybullet")
-    pytest.importorskip("pybullet_envs_gymnasium")
     path = record_rollout(still, tmp_path / "ant.gif", seconds=0.3, fps=10, size=(64, 48))
     with image.open(path) as gif:
         # frames at 0, 0.1 and 0.2 s

@@ -17,6 +17,9 @@ def _array(value: Any) -> np.ndarray:
 class MeanPolicy:
     """The imitator's mean action, computed with NumPy alone so that it travels cheaply to a worker process.
 
+    Row b of a batch is, to the last bit, the action of observation b alone, so that results do not depend on how
+    episodes are grouped; :attr:`batched` tells the evaluation so.
+
     Args:
         layers: one tuple ``(weight [out, in], bias [out], norm_weight [out] or None)`` a linear layer; where a
             norm weight is given, RMSNorm and Squish follow. The last layer gives ``[..., 2 * A]``, mean first.
@@ -30,6 +33,8 @@ class MeanPolicy:
         >>> policy(np.array([1.0, 2.0, 3.0]))
         array([6., 6.], dtype=float32)
     """
+
+    batched = True
 
     def __init__(
         self,
@@ -83,8 +88,11 @@ class MeanPolicy:
         """Maps an observation ``[*B, obs_dim]`` to the mean action ``[*B, A]``."""
         x = np.asarray(observation, dtype=np.float32)
         for weight, bias, norm in self.layers:
-            x = x @ weight.T + bias
+            # Not x @ weight.T: BLAS rounds differently by the size of the batch and the number of threads.
+            x = np.einsum("oi,...i->...o", weight, x)
+            x += bias
             if norm is not None:
-                x = x / np.sqrt(np.mean(x * x, -1, keepdims=True) + np.float32(self.eps)) * norm
-                x = x * (1 + x / np.sqrt(x * x + 4)) / 2
+                x /= np.sqrt(np.add.reduce(x * x, -1, keepdims=True) / np.float32(x.shape[-1]) + np.float32(self.eps))
+                x *= norm
+                x *= (1 + x / np.sqrt(x * x + 4)) / 2
         return x[..., : x.shape[-1] // 2]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import multiprocessing
 import os
 import pickle
@@ -16,64 +15,15 @@ from typing import Any
 
 import numpy as np
 
+from torchrl_tsallis.evaluation.episodes import EnvFn, EpisodeError, Policy, make_environment, run_episodes
 from torchrl_tsallis.evaluation.mean_policy import MeanPolicy
 
-Policy = Callable[[np.ndarray], np.ndarray]
 Task = tuple[str, int]
 DEFAULT_ENV = "torchrl_tsallis.envs:make_ant"
+#: Most episodes that a worker steps in turn: fewer batch the policy less, more do not fit the processor's caches.
+GROUP = 8
 _THREADS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
 _WORKER: dict[str, Any] = {}
-
-
-def resolve(env_fn: str | Callable[[], Any]) -> Callable[..., Any]:
-    """Imports ``"module:function"``; a callable passes through.
-
-    Examples:
-        >>> resolve("math:sqrt")(4.0)
-        2.0
-    """
-    if callable(env_fn):
-        return env_fn
-    module, _, name = env_fn.partition(":")
-    if not name:
-        raise ValueError(f"env_fn must be 'module:function' or a callable, got {env_fn!r}")
-    found: Callable[..., Any] = getattr(importlib.import_module(module), name)
-    return found
-
-
-def run_episode(policy: Policy, env_fn: str | Callable[[], Any], seed: int) -> tuple[float, int]:
-    """Runs one episode in an environment of its own.
-
-    A fresh environment makes the result a function of policy and seed alone. It is reset once and thrown away
-    first, because PyBullet's first episode differs: the floor joins the scene's parts only after that reset.
-
-    Args:
-        policy: maps an observation to an action, which is clipped to the action space.
-        env_fn: makes a Gymnasium environment.
-        seed: given to ``reset``.
-
-    Returns:
-        The sum of rewards and the number of steps.
-
-    Raises:
-        ValueError: if the policy gives a wrong shape or a number that is not finite.
-    """
-    env = resolve(env_fn)()
-    try:
-        env.reset(seed=seed)
-        observation, _ = env.reset(seed=seed)
-        low, high = env.action_space.low, env.action_space.high
-        total, length, done = 0.0, 0, False
-        while not done:
-            action = np.asarray(policy(observation))
-            if action.shape != low.shape or not np.isfinite(action).all():
-                raise ValueError(f"step {length}: need a finite action of shape {low.shape}, got {action}")
-            action = np.clip(action, low, high).astype(low.dtype)
-            observation, reward, terminated, truncated, _ = env.step(action)
-            total, length, done = total + float(reward), length + 1, bool(terminated or truncated)
-        return total, length
-    finally:
-        env.close()
 
 
 def evaluate_policies(
@@ -82,14 +32,19 @@ def evaluate_policies(
     episodes: int = 100,
     seed: int = 10_000,
     workers: int = 2,
-    env_fn: str | Callable[[], Any] = DEFAULT_ENV,
+    env_fn: EnvFn = DEFAULT_ENV,
     retries: int = 2,
     progress: bool = True,
 ) -> list[dict[str, Any]]:
-    """Runs every policy on the same seeds in worker processes.
+    """Runs every policy on the same seeds in worker processes, each of which steps up to 8 environments in turn.
+
+    A worker uses its environments again, so an episode must depend on the seed of ``reset`` alone once an environment
+    was reset before. The Ant's does; its physics is restored bit for bit.
 
     Args:
-        policies: name -> picklable callable, or an actor's state for :meth:`MeanPolicy.from_actor_state`.
+        policies: name -> picklable callable, observation -> action (for batches see
+            :func:`~torchrl_tsallis.evaluation.episodes.run_episodes`), or an actor's state for
+            :meth:`MeanPolicy.from_actor_state`.
         episodes: episodes a policy (100, section V-B); episode i is seeded ``seed + i`` for every policy.
         seed: first seed (10000).
         workers: processes, each with one thread (2); 0 runs in this process.
@@ -99,7 +54,7 @@ def evaluate_policies(
 
     Returns:
         Rows ``{"policy", "episode", "seed", "return", "length"}`` by policy and episode; they do not depend on
-        the number of workers.
+        the number of workers, to the last bit.
 
     Raises:
         ValueError: if nothing is to be run or a policy cannot be pickled.
@@ -119,76 +74,98 @@ def evaluate_policies(
         name: p if callable(p) else MeanPolicy.from_actor_state(p) for name, p in policies.items()
     }
     tasks = [(name, episode) for name in ready for episode in range(episodes)]
+    # As many groups a policy as keep all workers busy to the end, if episodes last equally long.
+    count = max(workers, 1) * -(-episodes // (GROUP * max(workers, 1)))
+    parts = np.array_split(np.arange(episodes), min(count, episodes))
+    groups = [[(name, int(episode)) for episode in part] for name in ready for part in parts]
     done: dict[Task, tuple[float, int]] = {}
     with _bar(len(tasks), progress) as tick, _one_thread():
         if workers == 0:
-            _start(ready, env_fn, seed)
-            for task in tasks:
-                done[task] = _work(task)
-                tick()
+            try:
+                _start(ready, env_fn, seed)
+                for group in groups:
+                    done.update(_work(group))
+                    tick(len(group))
+            finally:
+                _stop()
         else:
             for name, policy in ready.items():
                 try:
                     pickle.dumps(policy)
                 except (pickle.PicklingError, AttributeError, TypeError) as error:
                     raise ValueError(f"policy {name!r} cannot be pickled ({error}): define it in a module") from error
-            _run_pool(tasks, (ready, env_fn, seed), workers, retries, done, tick)
+            _run_pool(groups, (ready, env_fn, seed), workers, retries, done, tick)
     return [
         {"policy": t[0], "episode": t[1], "seed": seed + t[1], "return": done[t][0], "length": done[t][1]}
         for t in tasks
     ]
 
 
-def _start(policies: dict[str, Policy], env_fn: str | Callable[[], Any], seed: int) -> None:
+def _start(policies: dict[str, Policy], env_fn: EnvFn, seed: int) -> None:
     """Keeps in a worker what its episodes share."""
-    _WORKER.update(policies=policies, env_fn=env_fn, seed=seed)
+    _WORKER.update(policies=policies, env_fn=env_fn, seed=seed, envs=[])
     if multiprocessing.parent_process() is not None and "torch" in sys.modules:
         sys.modules["torch"].set_num_threads(1)
 
 
-def _work(task: Task) -> tuple[float, int]:
-    """Runs one episode; an error names it."""
-    name, episode = task
-    seed = _WORKER["seed"] + episode
+def _stop() -> None:
+    """Closes the environments of this process."""
+    for env in _WORKER.pop("envs", []):
+        env.close()
+    _WORKER.clear()
+
+
+def _work(group: list[Task]) -> dict[Task, tuple[float, int]]:
+    """Runs episodes of one policy together; an error names the one that failed."""
+    name, first, envs = group[0][0], _WORKER["seed"], _WORKER["envs"]
+    seeds = [first + episode for _, episode in group]
     try:
-        return run_episode(_WORKER["policies"][name], _WORKER["env_fn"], seed)
-    except Exception as error:
-        raise RuntimeError(f"policy {name!r}, episode {episode} (seed {seed}) failed: {error!r}") from error
+        while len(envs) < len(group):
+            envs.append(make_environment(_WORKER["env_fn"], seeds[len(envs)]))
+        return dict(zip(group, run_episodes(_WORKER["policies"][name], envs, seeds), strict=True))
+    except EpisodeError as failure:
+        seed, error = failure.seed, failure.__cause__
+        raise RuntimeError(f"policy {name!r}, episode {seed - first} (seed {seed}) failed: {error!r}") from error
 
 
 def _run_pool(
-    tasks: list[Task], shared: tuple[Any, ...], workers: int, retries: int, done: dict, tick: Callable[[], Any]
+    groups: list[list[Task]],
+    shared: tuple[Any, ...],
+    workers: int,
+    retries: int,
+    done: dict,
+    tick: Callable[[int], Any],
 ) -> None:
-    """Runs the tasks; those in flight when a worker dies are tried again one at a time, to find the culprit."""
-    queue, suspects, deaths = deque(tasks), deque[Task](), Counter[Task]()
+    """Runs the groups; the episodes in flight when a worker dies are tried again one at a time, to find the culprit."""
+    queue, suspects, deaths = deque(groups), deque[list[Task]](), Counter[Task]()
     context = multiprocessing.get_context("spawn")
     while queue or suspects:
         pool = ProcessPoolExecutor(workers, mp_context=context, initializer=_start, initargs=shared)
-        flying: dict[Future, Task] = {}
+        flying: dict[Future, list[Task]] = {}
         try:
             while queue or suspects or flying:
                 source, room = (suspects, 1) if suspects else (queue, workers)
                 while source and len(flying) < room:
-                    task = source.popleft()
+                    group = source.popleft()
                     try:
-                        flying[pool.submit(_work, task)] = task
+                        flying[pool.submit(_work, group)] = group
                     except BrokenProcessPool:
-                        source.appendleft(task)
+                        source.appendleft(group)
                         raise
                 for future in wait(flying, return_when=FIRST_COMPLETED).done:
-                    done[flying[future]] = future.result()
-                    del flying[future]
-                    tick()
+                    done.update(future.result())
+                    tick(len(flying.pop(future)))
         except BrokenProcessPool as error:
-            deaths.update(flying.values())
-            lost = [task for task in flying.values() if deaths[task] > retries]
+            hit = [task for group in flying.values() for task in group]
+            deaths.update(hit)
+            lost = [task for task in hit if deaths[task] > retries]
             if lost:
                 names = ", ".join(f"{name!r} episode {episode}" for name, episode in lost)
                 raise RuntimeError(
                     f"the worker process died {retries + 1} times on {names}: check memory, and run it with "
                     "workers=0 to see the cause"
                 ) from error
-            suspects.extend(flying.values())
+            suspects.extend([task] for task in hit)
         finally:
             pool.shutdown(wait=True, cancel_futures=True)
 
@@ -209,14 +186,14 @@ def _one_thread() -> Iterator[None]:
 
 
 @contextmanager
-def _bar(total: int, show: bool) -> Iterator[Callable[[], Any]]:
+def _bar(total: int, show: bool) -> Iterator[Callable[[int], Any]]:
     """Yields a function that advances the progress bar."""
     try:
         from tqdm import tqdm
     except ImportError:
         show = False
     if not show:
-        yield lambda: None
+        yield lambda _: None
         return
     with tqdm(total=total, unit="episode", desc="evaluate") as bar:
         yield bar.update

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from torchrl_tsallis._io import atomic_path
-from torchrl_tsallis.evaluation.rollouts import DEFAULT_ENV, Policy, resolve
+from torchrl_tsallis.evaluation.episodes import EnvFn, Policy, resolve
+from torchrl_tsallis.evaluation.rollouts import DEFAULT_ENV
 
 
 def record_rollout(
@@ -21,7 +20,7 @@ def record_rollout(
     fps: int = 15,
     seed: int = 10_000,
     size: tuple[int, int] = (320, 240),
-    env_fn: str | Callable[..., Any] = DEFAULT_ENV,
+    env_fn: EnvFn = DEFAULT_ENV,
     step_seconds: float = 0.0165,
 ) -> Path:
     """Records the start of an episode as ``.gif`` (needs pillow) or ``.mp4`` (needs imageio-ffmpeg).
@@ -82,7 +81,7 @@ def _frames(
     fps: int,
     seed: int,
     size: tuple[int, int],
-    env_fn: str | Callable[..., Any],
+    env_fn: EnvFn,
     step_seconds: float,
 ) -> list[np.ndarray]:
     """Runs the episode and draws frame k at the first step at or after k / fps seconds."""
