@@ -5,13 +5,12 @@ from __future__ import annotations
 import multiprocessing
 import os
 import signal
+import sys
 import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from typing import Any, TypeVar
-
-import torch
 
 Job = TypeVar("Job")
 Result = TypeVar("Result")
@@ -25,21 +24,33 @@ def tick(count: int = 1) -> None:
         _QUEUE.put(count)
 
 
+def prepare_worker() -> None:
+    """Prepares a worker process: one thread, no reaction to Ctrl-C, and an end with its main process."""
+    parent = multiprocessing.parent_process()
+    if parent is None:
+        return
+    if "torch" in sys.modules:
+        sys.modules["torch"].set_num_threads(1)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all processes of a terminal; the main one decides
+
+    def end() -> None:
+        parent.join()
+        os._exit(1)  # a worker whose main process was killed would go on beside the resumed run
+
+    threading.Thread(target=end, daemon=True).start()
+
+
+def terminate_workers() -> None:
+    """Ends this process's workers at once, in the middle of what they do."""
+    for process in multiprocessing.active_children():
+        process.terminate()
+
+
 def _start(queue: Any) -> None:
-    """Prepares a worker process."""
+    """Prepares a worker process of :func:`run_jobs`."""
     global _QUEUE
     _QUEUE = queue
-    torch.set_num_threads(1)
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all processes of a terminal; the main one decides
-    threading.Thread(target=_end_with_parent, daemon=True).start()
-
-
-def _end_with_parent() -> None:
-    """Ends a worker whose main process was killed: it would go on writing beside the resumed run."""
-    parent = multiprocessing.parent_process()
-    if parent is not None:
-        parent.join()
-        os._exit(1)
+    prepare_worker()
 
 
 def run_jobs(
@@ -87,8 +98,7 @@ def run_jobs(
                     bar.update(queue.get())
         except BaseException as error:
             pool.shutdown(wait=False, cancel_futures=True)
-            for process in multiprocessing.active_children():
-                process.terminate()
+            terminate_workers()
             if isinstance(error, BrokenProcessPool):
                 raise RuntimeError(
                     f"a worker process died while {desc} (killed, or out of memory): try again with fewer workers"

@@ -55,8 +55,12 @@ def test_the_policy_by_hand():
     t = p.tensors
     hidden = np.maximum(np.maximum(x @ t["w1"] + t["b1"], 0) @ t["w2"] + t["b2"], 0)
     np.testing.assert_allclose(p(x), np.tanh((hidden @ t["w3"] + t["b3"])[:2]), rtol=1e-6)
+    noise = [5.0 * np.random.default_rng(i).standard_normal(2) for i in range(50)]
     noisy = np.stack([p.act(x, np.random.default_rng(i), 5.0) for i in range(50)])
-    assert np.abs(noisy).max() == 1
+    np.testing.assert_allclose(noisy, p(x) + noise, rtol=1e-5)  # commands are recorded as they were sampled
+    clipped = np.stack([p.act(x, np.random.default_rng(i), 5.0, clip=True) for i in range(50)])
+    np.testing.assert_array_equal(clipped, np.clip(noisy, -1, 1))
+    assert np.abs(noisy).max() > 1
     assert p.act(x, np.random.default_rng(0), 0.0) == pytest.approx(p(x))
 
 

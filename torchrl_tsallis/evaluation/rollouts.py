@@ -5,7 +5,6 @@ from __future__ import annotations
 import multiprocessing
 import os
 import pickle
-import sys
 from collections import Counter, deque
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
@@ -15,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from torchrl_tsallis._pool import prepare_worker, terminate_workers
 from torchrl_tsallis.evaluation.episodes import EnvFn, EpisodeError, Policy, make_environment, run_episodes
 from torchrl_tsallis.evaluation.mean_policy import MeanPolicy
 
@@ -104,8 +104,7 @@ def evaluate_policies(
 def _start(policies: dict[str, Policy], env_fn: EnvFn, seed: int) -> None:
     """Keeps in a worker what its episodes share."""
     _WORKER.update(policies=policies, env_fn=env_fn, seed=seed, envs=[])
-    if multiprocessing.parent_process() is not None and "torch" in sys.modules:
-        sys.modules["torch"].set_num_threads(1)
+    prepare_worker()
 
 
 def _stop() -> None:
@@ -166,6 +165,9 @@ def _run_pool(
                     "workers=0 to see the cause"
                 ) from error
             suspects.extend([task] for task in hit)
+        except KeyboardInterrupt:
+            terminate_workers()
+            raise
         finally:
             pool.shutdown(wait=True, cancel_futures=True)
 
