@@ -51,6 +51,7 @@ class TsallisBCLoss(LossModule):
     ``ess``               effective sample size of the batch under the rating, in samples
     ``log_prob``          mean log-density of the batch
     ``bound``             mean upper bound of the rating (eq. 12)
+    ``member_loss``       only with stacked members: the loss of each, ``[S]``
     ====================  =====================================================================
 
     **Stacked members.** A list of S actors trains all of them as one program: parameters ``[S, ...]``, batches
@@ -145,6 +146,8 @@ class TsallisBCLoss(LossModule):
         )
         self.register_buffer("q", torch.tensor(q_values if members else q_values[0]))
         self.reduction = reduction or "mean"
+        if members and self.reduction != "none":
+            self.out_keys = [*self.out_keys, "member_loss"]
         #: Which stacked members are rated by their target network, ``[S]`` bool; None for all of them.
         self.target_members: Tensor | None = None
         if members and reference is None and self.needs_target and 0.0 in levels:
@@ -312,11 +315,14 @@ class TsallisBCLoss(LossModule):
         """
         log_prob, log_reference, gamma, moment, mask = self._rate(tensordict)
         losses, weights = rated_nll(log_prob, log_reference, per_sample(self.q, log_prob))
-        if self.num_members is not None and self.reduction == "mean":
-            loss = self._mean(losses, mask).sum()  # each member gets the gradient that it would have by itself
-        else:
-            loss = self._reduce_loss(losses, tensordict)
-        out = {"loss_tsallis_bc": loss}
+        if self.num_members is None or self.reduction == "none":
+            out = {"loss_tsallis_bc": self._reduce_loss(losses, tensordict)}
+        else:  # the sum over members: each gets the gradient that it would have by itself
+            if self.reduction == "mean":
+                of_member = self._mean(losses, mask)
+            else:
+                of_member = (losses if mask is None else losses.where(mask, 0.0)).flatten(1).sum(1)
+            out = {"loss_tsallis_bc": of_member.sum(), "member_loss": of_member.detach()}
         with torch.no_grad():
             detached = log_prob.detach()
             if not torch._C._functorch.is_batchedtensor(detached):  # would leak out of torch.vmap
