@@ -43,6 +43,7 @@ class Segments:
                     f"a tensor of shape {tuple(x.shape)} has no {batch_dims} leading ensemble dimensions; "
                     "put it in a group of its own with batch_dims=0"
                 )
+        self.batch_dims = batch_dims
         self.shapes = [x.shape for x in tensors]
         self.batch_shapes = [x.shape[:batch_dims] for x in tensors]
         self.sizes = [x.numel() for x in tensors]

@@ -34,6 +34,23 @@ def _like(value: float | Tensor, reference: Tensor) -> Tensor:
     return torch.full((), value, dtype=reference.dtype, device=reference.device)
 
 
+def per_sample(value: Tensor, samples: Tensor) -> Tensor:
+    """Shapes one value per member so that it broadcasts over the member's samples.
+
+    Args:
+        value: ``[*S]``, or a scalar, which broadcasts as it is.
+        samples: ``[*S, *B]``.
+
+    Returns:
+        A view of ``value``, ``[*S, 1, ...]``.
+
+    Examples:
+        >>> per_sample(torch.ones(3), torch.ones(3, 4, 5)).shape
+        torch.Size([3, 1, 1])
+    """
+    return value[(...,) + (None,) * (samples.ndim - value.ndim)] if value.ndim else value
+
+
 def _phi1_derivative(z: Tensor) -> Tensor:
     """d/dz of (exp(z) - 1) / z, by its series near 0 where the closed form cancels."""
     near = z.abs() < 1
@@ -261,14 +278,15 @@ def density_moment(log_prob: Tensor, q: float | Tensor, dim: int = -1) -> Tensor
     return (u * log_prob).clamp(max=MAX_EXPONENT).exp().mean(dim)
 
 
-def adaptive_gamma(moment: Tensor, gamma_min: float = 0.1, gamma_max: float = 0.9) -> Tensor:
+def adaptive_gamma(moment: Tensor, gamma_min: float | Tensor = 0.1, gamma_max: float | Tensor = 0.9) -> Tensor:
     r"""The relative rating level that fixes the mean bound of the rating at one (eq. 13).
 
     .. math:: \gamma = \mathrm{clip}(1 - \mathbb{E}[\pi^{1-q}], \underline\gamma, \overline\gamma)
 
     Args:
         moment: :math:`\mathbb{E}[\pi^{1-q}]` from :func:`density_moment`, ``[*S]``.
-        gamma_min: lower bound (0.1, section V-B), leaves the relative rating room to act.
+        gamma_min: lower bound (0.1, section V-B), leaves the relative rating room to act. A number, or ``[*S]``
+            together with the other one.
         gamma_max: upper bound (0.9, section V-B), keeps the bound of the rating finite.
 
     Returns:
@@ -278,7 +296,7 @@ def adaptive_gamma(moment: Tensor, gamma_min: float = 0.1, gamma_max: float = 0.
         >>> adaptive_gamma(torch.tensor([0.0, 0.6, 1.3]))
         tensor([0.9000, 0.4000, 0.1000])
     """
-    return (1 - moment).clamp(gamma_min, gamma_max)
+    return (1 - moment).clamp(gamma_min, gamma_max)  # type: ignore[arg-type]
 
 
 def bound_ratio(

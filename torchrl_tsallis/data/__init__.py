@@ -11,14 +11,17 @@ from torchrl_tsallis.data.demonstrations import (
 )
 from torchrl_tsallis.data.policy import NumpyPolicy, load_policy
 from torchrl_tsallis.data.replay import make_replay_buffer
+from torchrl_tsallis.data.stacked import MemberSampler, make_stacked_replay_buffer
 
 __all__ = [
     "TASKS",
+    "MemberSampler",
     "NumpyPolicy",
     "add_action_noise",
     "load_demonstrations",
     "load_policy",
     "make_replay_buffer",
+    "make_stacked_replay_buffer",
     "make_task",
     "record_trajectory",
     "replace_with_amateur",

@@ -1,12 +1,20 @@
-"""The distribution of an actor, at the cost of its network."""
+"""The distribution of an actor, or of stacked ones, at the cost of the network."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
-from tensordict import TensorDictBase
-from tensordict.nn import ProbabilisticTensorDictModule, ProbabilisticTensorDictSequential, TensorDictModule
+import torch
+from tensordict import TensorDictBase, is_tensor_collection
+from tensordict.nn import (
+    CompositeDistribution,
+    ProbabilisticTensorDictModule,
+    ProbabilisticTensorDictSequential,
+    TensorDictModule,
+)
+from tensordict.utils import NestedKey
+from torch import Tensor
 from torch.distributions import Distribution
 
 
@@ -27,6 +35,17 @@ def _network_and_head(
         and all(key in network.out_keys for key in head.in_keys)
     )
     return (network, head) if plain else None
+
+
+def _call(network: TensorDictModule, tensors: Sequence[Any]) -> dict[NestedKey, Any]:
+    """The network's outputs by key, as its ``TensorDictModule`` would write them."""
+    out: Any = network.module(*tensors)
+    keys = network.out_keys
+    if isinstance(out, (Mapping, TensorDictBase)) and all(key in out for key in keys):
+        out = [out[key] for key in keys]
+    elif not isinstance(out, (tuple, list)):
+        out = [out]
+    return dict(zip(keys, out, strict=True))
 
 
 def get_dist(actor: ProbabilisticTensorDictSequential, inputs: TensorDictBase) -> Distribution:
@@ -53,10 +72,73 @@ def get_dist(actor: ProbabilisticTensorDictSequential, inputs: TensorDictBase) -
     if parts is None:
         return actor.get_dist(inputs.copy())
     network, head = parts
-    out: Any = network.module(*(inputs.get(key) for key in network.in_keys))
-    keys = network.out_keys
-    if isinstance(out, (Mapping, TensorDictBase)) and all(key in out for key in keys):
-        out = [out[key] for key in keys]
-    elif not isinstance(out, (tuple, list)):
-        out = [out]
-    return head.get_dist(dict(zip(keys, out, strict=True)))
+    return head.get_dist(_call(network, [inputs.get(key) for key in network.in_keys]))
+
+
+def get_stacked_dist(
+    actor: ProbabilisticTensorDictSequential,
+    inputs: TensorDictBase,
+    params: TensorDictBase,
+    randomness: str = "error",
+) -> Distribution:
+    """Distribution of S members at once, each with parameters and a batch of its own.
+
+    Only the networks are vectorized by ``torch.vmap``; the distribution is made of the stacked results, because its
+    checks of values cannot run under vmap.
+
+    Args:
+        actor: stochastic actor whose structure all members have.
+        inputs: with the actor's input keys, ``[S, *B]``.
+        params: the members' parameters, ``[S]``.
+        randomness: of ``torch.vmap``.
+
+    Returns:
+        The distribution of the action, batch shape ``[S, *B]``.
+
+    Raises:
+        NotImplementedError: for an actor of several distributions (``return_composite``).
+    """
+    parts = _network_and_head(actor)
+    if actor.return_composite:
+        raise NotImplementedError("stacked members need an actor with one distribution (return_composite=False)")
+
+    def call(params: TensorDictBase, *given: Any) -> Any:
+        with params.to_module(actor, preserve_module_state=False):
+            return actor.get_dist_params(*given) if parts is None else _call(parts[0], given)
+
+    vectorized = torch.vmap(call, randomness=randomness)
+    if parts is None:
+        return actor.build_dist_from_params(vectorized(params, inputs.copy()))
+    return parts[1].get_dist(vectorized(params, *(inputs.get(key) for key in parts[0].in_keys)))
+
+
+def log_prob_of(dist: Distribution, inputs: TensorDictBase, action_key: NestedKey) -> Tensor:
+    """Log-density at the actions, after a check of the shapes, which broadcasting would hide.
+
+    Args:
+        dist: the actor's distribution, batch shape ``[*B]``.
+        inputs: with the action, ``[*B]``.
+        action_key: key of the action.
+
+    Returns:
+        The log-density, ``[*B]``.
+
+    Raises:
+        ValueError: if the shapes do not fit.
+    """
+    if isinstance(dist, CompositeDistribution):
+        log_prob = dist.log_prob(inputs)
+        return torch.stack(list(log_prob.values(True, True))).sum(0) if is_tensor_collection(log_prob) else log_prob
+    action, expected = inputs.get(action_key), dist.batch_shape + dist.event_shape
+    if dist.event_shape and action.shape != expected:
+        raise ValueError(
+            f"{action_key!r} has shape {list(action.shape)}, the actor's distribution {list(expected)}: the two must "
+            "be equal (check the actor's action_dim and the batch size)"
+        )
+    log_prob = dist.log_prob(action)
+    if log_prob.shape != inputs.batch_size:
+        raise ValueError(
+            f"log_prob has shape {list(log_prob.shape)}, the batch {list(inputs.batch_size)}: give the batch its "
+            "full batch size, and use a distribution that sums over the action's dimensions (IndependentNormal)"
+        )
+    return log_prob

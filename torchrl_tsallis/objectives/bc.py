@@ -2,22 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from tensordict import TensorDict, TensorDictBase, TensorDictParams, is_tensor_collection
-from tensordict.nn import CompositeDistribution, ProbabilisticTensorDictSequential, dispatch
+from tensordict.nn import ProbabilisticTensorDictSequential, dispatch
 from tensordict.utils import NestedKey, expand_right, unravel_key
-from torch import Tensor
+from torch import Tensor, nn
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.modules import set_recurrent_mode
 from torchrl.objectives.common import LossModule
 
-from torchrl_tsallis.functional import bound_ratio, rated_nll, rating
-from torchrl_tsallis.objectives.actor import get_dist
+from torchrl_tsallis.functional import bound_ratio, per_sample, rated_nll, rating
+from torchrl_tsallis.objectives.actor import get_dist, get_stacked_dist, log_prob_of
 from torchrl_tsallis.objectives.reference import MixtureReference, ReferenceDensity
-from torchrl_tsallis.objectives.statistics import rating_statistics
+from torchrl_tsallis.objectives.statistics import masked_mean, rating_statistics
 
 
 class TsallisBCLoss(LossModule):
@@ -40,7 +41,7 @@ class TsallisBCLoss(LossModule):
     ==============================  ==========================================================
 
     Reads the observation keys of the actor and ``action`` (``[*B, A]``). Writes the keys below; all but the loss are
-    detached scalars.
+    detached scalars, or ``[S]``.
 
     ====================  =====================================================================
     ``loss_tsallis_bc``   the loss, a scalar, or ``[*B]`` with ``reduction="none"``
@@ -50,7 +51,13 @@ class TsallisBCLoss(LossModule):
     ``ess``               effective sample size of the batch under the rating, in samples
     ``log_prob``          mean log-density of the batch
     ``bound``             mean upper bound of the rating (eq. 12)
+    ``member_loss``       only with stacked members: the loss of each, ``[S]``
     ====================  =====================================================================
+
+    **Stacked members.** A list of S actors trains all of them as one program: parameters ``[S, ...]``, batches
+    ``[S, *B]``, and with sequences for ``q`` and ``gamma_mix`` each member by its own method. The loss is the sum of
+    the members' means, so that each has the gradient that it would have alone; every other output is ``[S]``. The
+    optimizer has to keep members apart, as ``AdaTerm(loss.parameters(), batch_dims=1)`` does.
 
     The target network exists only if the reference needs it. With a target network, a target updater such as
     :class:`~torchrl_tsallis.CATSoftUpdate` has to follow the policy.
@@ -59,11 +66,14 @@ class TsallisBCLoss(LossModule):
     Tsallis Statistics", SII 2025.
 
     Args:
-        actor_network: stochastic actor; any whose ``get_dist`` gives a distribution with ``log_prob``.
+        actor_network: stochastic actor; any whose ``get_dist`` gives a distribution with ``log_prob``. A list of them,
+            alike but for their parameters, are stacked members.
 
     Keyword Args:
-        q (float): Tsallis index in [0, 1], the start value where it is tuned. Default: 0.8.
-        gamma_mix (float or "adaptive"): relative rating level in [0, 1]. Default: ``"adaptive"`` (eq. 13).
+        q (float): Tsallis index in [0, 1], the start value where it is tuned, or a sequence of them, one a member.
+            Default: 0.8.
+        gamma_mix (float or "adaptive"): relative rating level in [0, 1], or a sequence, one a member.
+            Default: ``"adaptive"`` (eq. 13).
         gamma_min (float): lower bound of the adaptive level. Default: 0.1.
         gamma_max (float): upper bound of the adaptive level. Default: 0.9.
         reference (ReferenceDensity): another reference density than the paper's mixture; ``gamma_mix`` and its bounds
@@ -107,27 +117,52 @@ class TsallisBCLoss(LossModule):
 
     def __init__(
         self,
-        actor_network: ProbabilisticTensorDictSequential,
+        actor_network: ProbabilisticTensorDictSequential | Sequence[ProbabilisticTensorDictSequential],
         *,
-        q: float = 0.8,
-        gamma_mix: float | Literal["adaptive"] = "adaptive",
+        q: float | Sequence[float] = 0.8,
+        gamma_mix: float | Literal["adaptive"] | Sequence[float | Literal["adaptive"]] = "adaptive",
         gamma_min: float = 0.1,
         gamma_max: float = 0.9,
         reference: ReferenceDensity | None = None,
         reduction: Literal["mean", "sum", "none"] | None = None,
     ) -> None:
         super().__init__()
-        if not 0 <= q <= 1:
+        members = None if isinstance(actor_network, nn.Module) else list(actor_network)
+        self.num_members = None if members is None else len(members)
+        q_values = self._per_member("q", q)
+        if not all(0 <= value <= 1 for value in q_values):
             raise ValueError(f"q must be in [0, 1] (1 is plain behavioral cloning), got {q}")
         if reduction not in (None, "mean", "sum", "none"):
             raise ValueError(f"reduction must be 'mean', 'sum' or 'none', got {reduction!r}")
         self._in_keys: list[NestedKey] | None = None
-        self.reference = reference or MixtureReference(gamma_mix, gamma_min, gamma_max)
+        levels = self._per_member("gamma_mix", gamma_mix)
+        self.reference = reference or MixtureReference(levels if members else levels[0], gamma_min, gamma_max)
         self.needs_target = self.reference.needs_target
-        self.convert_to_functional(actor_network, "actor_network", create_target_params=self.needs_target)
-        self.register_coeff_buffer("q", q)
+        self.convert_to_functional(
+            members or actor_network,
+            "actor_network",
+            expand_dim=self.num_members,
+            create_target_params=self.needs_target,
+        )
+        self.register_buffer("q", torch.tensor(q_values if members else q_values[0]))
         self.reduction = reduction or "mean"
+        if members and self.reduction != "none":
+            self.out_keys = [*self.out_keys, "member_loss"]
+        #: Which stacked members are rated by their target network, ``[S]`` bool; None for all of them.
+        self.target_members: Tensor | None = None
+        if members and reference is None and self.needs_target and 0.0 in levels:
+            self.target_members = torch.tensor([level != 0 for level in levels])
         self._last_batch: tuple[Tensor, Tensor | None] | None = None
+
+    def _per_member(self, name: str, value: Any) -> list[Any]:
+        """A setting of each member; of the one policy where there are none."""
+        count = self.num_members or 1
+        if isinstance(value, str) or not isinstance(value, (Sequence, Tensor)) or getattr(value, "ndim", 1) == 0:
+            return [value if isinstance(value, str) else float(value)] * count
+        values = value.tolist() if isinstance(value, Tensor) else list(value)
+        if self.num_members is None or len(values) != count:
+            raise ValueError(f"{name} has {len(values)} values for {count} policies: give a number or one of each")
+        return [x if isinstance(x, str) else float(x) for x in values]
 
     def _forward_value_estimator_keys(self, **kwargs: NestedKey) -> None:
         """Behavioral cloning has no value estimator to forward the keys to."""
@@ -152,13 +187,41 @@ class TsallisBCLoss(LossModule):
     def last_log_prob(self) -> Tensor:
         """Log-densities of the last batch that ``forward`` saw, valid samples only, detached, ``[N]``.
 
+        With stacked members, whose numbers of valid samples differ, all samples, ``[S, N]``; see :attr:`last_mask`.
+
         Raises:
             RuntimeError: before the first ``forward``.
         """
         if self._last_batch is None:
             raise RuntimeError("no batch was rated yet: call the loss before what reads its log-densities")
         log_prob, mask = self._last_batch
+        if self.num_members is not None:
+            return log_prob.flatten(1)
         return log_prob.reshape(-1) if mask is None else log_prob[mask]
+
+    @property
+    def last_mask(self) -> Tensor | None:
+        """Validity of the entries of :attr:`last_log_prob`, ``[S, N]``; None where all of them are valid."""
+        if self.num_members is None or self._last_batch is None or self._last_batch[1] is None:
+            return None
+        return self._last_batch[1].flatten(1)
+
+    def member_state_dict(self, member: int) -> dict[str, Tensor]:
+        """State dict of the actor of one stacked member; ``actor.load_state_dict`` takes it.
+
+        Args:
+            member: index of the member, in the order of the actors that the loss was made of.
+
+        Returns:
+            Copies of the member's parameters, by the actor's own names.
+
+        Raises:
+            ValueError: if the loss has no stacked members.
+        """
+        if self.num_members is None:
+            raise ValueError("the loss has one policy, not stacked members: use actor.state_dict()")
+        params = self.actor_network_params.data[member].flatten_keys(".")
+        return {name: value.clone() for name, value in params.items()}
 
     def _mask(self, tensordict: TensorDictBase) -> Tensor | None:
         """The valid samples, ``[*B]`` bool; None where the batch carries no mask."""
@@ -172,6 +235,11 @@ class TsallisBCLoss(LossModule):
 
     def _inputs(self, tensordict: TensorDictBase, mask: Tensor | None) -> TensorDictBase:
         """The actor's inputs and the action alone, checked; the caller's tensordict is never written to."""
+        if self.num_members is not None and tensordict.shape[:1] != (self.num_members,):
+            raise ValueError(
+                f"the batch of shape {list(tensordict.shape)} must have the {self.num_members} members first: "
+                "sample it from make_stacked_replay_buffer, or use tensordict.expand(members, ...)"
+            )
         if 0 in tensordict.shape:
             raise ValueError(f"the batch of shape {list(tensordict.shape)} is empty: pass at least one sample")
         missing = [key for key in self.in_keys if key not in tensordict.keys(True)]
@@ -197,27 +265,15 @@ class TsallisBCLoss(LossModule):
     def _dist_log_prob(
         self, inputs: TensorDictBase, params: TensorDictParams
     ) -> tuple[torch.distributions.Distribution, Tensor]:
-        with params.to_module(self.actor_network, preserve_module_state=False):
-            dist = get_dist(self.actor_network, inputs)
-        action = inputs.get(self.tensor_keys.action)
-        if isinstance(dist, CompositeDistribution):
-            log_prob = dist.log_prob(inputs)
-            if is_tensor_collection(log_prob):
-                log_prob = torch.stack(list(log_prob.values(True, True))).sum(0)
-            return dist, log_prob
-        expected = dist.batch_shape + dist.event_shape
-        if dist.event_shape and action.shape != expected:  # broadcasting would hide it
-            raise ValueError(
-                f"{self.tensor_keys.action!r} has shape {list(action.shape)}, the actor's distribution "
-                f"{list(expected)}: the two must be equal (check the actor's action_dim and the batch size)"
-            )
-        log_prob = dist.log_prob(action)
-        if log_prob.shape != inputs.batch_size:
-            raise ValueError(
-                f"log_prob has shape {list(log_prob.shape)}, the batch {list(inputs.batch_size)}: give the batch its "
-                "full batch size, and use a distribution that sums over the action's dimensions (IndependentNormal)"
-            )
-        return dist, log_prob
+        if self.num_members is not None:
+            dist = get_stacked_dist(self.actor_network, inputs, params, self.vmap_randomness)
+        else:
+            with params.to_module(self.actor_network, preserve_module_state=False):
+                dist = get_dist(self.actor_network, inputs)
+        return dist, log_prob_of(dist, inputs, self.tensor_keys.action)
+
+    def _mean(self, x: Tensor, mask: Tensor | None) -> Tensor:
+        return masked_mean(x, mask, self.num_members is not None)
 
     def _rate(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor | None]:
         """Log-density (with gradient), log reference, gamma, E[pi^(1-q)] and the mask."""
@@ -229,8 +285,7 @@ class TsallisBCLoss(LossModule):
             target_log_prob = None
             if self.needs_target:
                 _, target_log_prob = self._dist_log_prob(inputs, self.target_actor_network_params)
-            density = rating(detached, 0.0, self.q)
-            moment = density.mean() if mask is None else density[mask].mean()
+            moment = self._mean(rating(detached, 0.0, per_sample(self.q, detached)), mask)
             reference = self.reference(dist, target_log_prob, moment)
         return log_prob, reference.log_density, reference.gamma_mix, moment, mask
 
@@ -246,7 +301,7 @@ class TsallisBCLoss(LossModule):
         """
         with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC), set_recurrent_mode(True):
             log_prob, log_reference, *_ = self._rate(tensordict)
-            return rating(log_prob, log_reference, self.q)
+            return rating(log_prob, log_reference, per_sample(self.q, log_prob))
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -259,16 +314,23 @@ class TsallisBCLoss(LossModule):
             A tensordict with the keys of ``out_keys``.
         """
         log_prob, log_reference, gamma, moment, mask = self._rate(tensordict)
-        per_sample, weights = rated_nll(log_prob, log_reference, self.q)
-        out = {"loss_tsallis_bc": self._reduce_loss(per_sample, tensordict)}
+        losses, weights = rated_nll(log_prob, log_reference, per_sample(self.q, log_prob))
+        if self.num_members is None or self.reduction == "none":
+            out = {"loss_tsallis_bc": self._reduce_loss(losses, tensordict)}
+        else:  # the sum over members: each gets the gradient that it would have by itself
+            if self.reduction == "mean":
+                of_member = self._mean(losses, mask)
+            else:
+                of_member = (losses if mask is None else losses.where(mask, 0.0)).flatten(1).sum(1)
+            out = {"loss_tsallis_bc": of_member.sum(), "member_loss": of_member.detach()}
         with torch.no_grad():
             detached = log_prob.detach()
             if not torch._C._functorch.is_batchedtensor(detached):  # would leak out of torch.vmap
                 self._last_batch = (detached, mask)
             out["q"] = self.q.clone()
             out["gamma_mix"] = gamma
-            out |= rating_statistics(weights, mask)
-            out["log_prob"] = detached.mean() if mask is None else detached[mask].mean()
+            out |= rating_statistics(weights, mask, self.num_members is not None)
+            out["log_prob"] = self._mean(detached, mask)
             out["bound"] = bound_ratio(moment, gamma=gamma)
         td_out = TensorDict(out, [])
         self._clear_weakrefs(tensordict, td_out, "actor_network_params", "target_actor_network_params")

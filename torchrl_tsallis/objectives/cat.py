@@ -30,7 +30,8 @@ class CATSoftUpdate(TargetNetUpdater):
         theta -= strength (tau - t) (theta - thetabar_before)
 
     ``t_nu`` and ``nu*`` are those of :func:`torchrl_tsallis._student_t.robust_rate` with rate ``tau``. Leading
-    dimensions of stacked (ensemble) parameters have scalars of their own. ``k=inf, strength=0`` is torchrl's
+    dimensions of stacked (ensemble) parameters have scalars of their own, and a member that the loss's
+    ``target_members`` leaves out is not pulled. ``k=inf, strength=0`` is torchrl's
     ``SoftUpdate(tau=tau)``. A loss without target parameters is accepted; nothing is updated then. Call
     :meth:`step` after the optimizer's step. A deep copy of the updater no longer follows: make a new one.
 
@@ -96,6 +97,7 @@ class CATSoftUpdate(TargetNetUpdater):
             return
         super().init_()
         sources = {f"target_{name}": source for name, source in self._sources.items()}
+        self._pulled = getattr(self.loss_module, "target_members", None)
         self._cat = {name: _Group(self, sources[name], target) for name, target in self._targets.items()}
 
     @torch.no_grad()
@@ -155,7 +157,7 @@ class _Group:
         """Makes the buffers, and moves the state to the parameters' data type and device."""
         like = self.target[0]
         self.state = {name: x.to(like) for name, x in self.state.items()}
-        self.segments = Segments(self.target, len(self.segments.batch_shapes[0]))
+        self.segments = Segments(self.target, self.segments.batch_dims)
         self.buffers = [self.segments.buffer(like) for _ in range(2)]
 
     def step(self, updater: CATSoftUpdate) -> None:
@@ -181,6 +183,9 @@ class _Group:
         torch._foreach_add_(target, followed_views)
         if updater.strength:  # strength (tau - t) d, by what was not followed
             d.mul_(tau).sub_(followed)
+            if updater._pulled is not None and seg.batch_dims == 1:
+                for view in d_views:  # a member that is not rated by its target is left alone
+                    view[~updater._pulled.to(view.device)] = 0.0
             torch._foreach_sub_(source, d_views, alpha=updater.strength)
 
     def views(self, name: str) -> dict[str, Tensor]:

@@ -6,20 +6,21 @@ another reference needs no other loss.
 
 from __future__ import annotations
 
-from typing import Literal, NamedTuple
+from collections.abc import Sequence
+from typing import Any, Literal, NamedTuple, cast
 
 import torch
 from torch import Tensor, nn
 
-from torchrl_tsallis.functional import adaptive_gamma, log_mixture
+from torchrl_tsallis.functional import adaptive_gamma, log_mixture, per_sample
 
 
 class Reference(NamedTuple):
     """A reference density at a batch's actions.
 
     Attributes:
-        log_density: its logarithm, ``[*B]`` or a scalar.
-        gamma_mix: the relative rating level in force, a scalar.
+        log_density: its logarithm, ``[*B]`` or a scalar; ``[S, *B]`` with members.
+        gamma_mix: the relative rating level in force, a scalar; ``[S]`` with members.
     """
 
     log_density: Tensor
@@ -42,7 +43,8 @@ class ReferenceDensity(nn.Module):
         Args:
             dist: the imitator's distribution, batch shape ``[*B]``.
             target_log_prob: the target network's log-density at the actions, ``[*B]``; None unless ``needs_target``.
-            moment: batch estimate of :math:`E[\pi^{1-q}]`, a scalar.
+            moment: batch estimate of :math:`E[\pi^{1-q}]`, a scalar. With stacked members every argument has their
+                dimension first, ``[S]`` here.
 
         Returns:
             The reference at the batch's actions.
@@ -64,7 +66,8 @@ class MixtureReference(ReferenceDensity):
     =========  ===========  ==========  ============
 
     Args:
-        gamma_mix: ``"adaptive"`` or a number in [0, 1]; 0 is q-BC (absolute rating), 1 the pure relative rating.
+        gamma_mix: ``"adaptive"`` or a number in [0, 1]; 0 is q-BC (absolute rating), 1 the pure relative rating. A
+            sequence has one of them for each of S stacked members.
         gamma_min: lower bound of the adaptive gamma.
         gamma_max: upper bound of the adaptive gamma.
 
@@ -76,36 +79,54 @@ class MixtureReference(ReferenceDensity):
         False
     """
 
+    lower: Tensor
+    upper: Tensor
+
     def __init__(
-        self, gamma_mix: float | Literal["adaptive"] = "adaptive", gamma_min: float = 0.1, gamma_max: float = 0.9
+        self,
+        gamma_mix: float | Literal["adaptive"] | Sequence[float | Literal["adaptive"]] = "adaptive",
+        gamma_min: float = 0.1,
+        gamma_max: float = 0.9,
     ) -> None:
         super().__init__()
         if not 0 < gamma_min <= gamma_max < 1:
             raise ValueError(f"0 < gamma_min <= gamma_max < 1 is needed, got {gamma_min=} and {gamma_max=}")
-        if isinstance(gamma_mix, str):
-            if gamma_mix != "adaptive":
-                raise ValueError(f"gamma_mix must be 'adaptive' or a number in [0, 1], got {gamma_mix!r}")
-        elif not 0 <= gamma_mix <= 1:
-            raise ValueError(f"gamma_mix must be 'adaptive' or a number in [0, 1], got {gamma_mix!r}")
-        self.gamma_mix = gamma_mix
+        many = isinstance(gamma_mix, Sequence) and not isinstance(gamma_mix, str)
+        levels: list[Any] = list(cast("Sequence[Any]", gamma_mix)) if many else [gamma_mix]
+        for level in levels:
+            if level != "adaptive" and (isinstance(level, str) or not 0 <= level <= 1):
+                raise ValueError(f"gamma_mix must be 'adaptive' or a number in [0, 1], got {level!r}")
+        self.levels = levels
+        self.members = many
         self.gamma_min = gamma_min
         self.gamma_max = gamma_max
-        self.adaptive = gamma_mix == "adaptive"
-        self.needs_target = gamma_mix != 0
+        self.adaptive = "adaptive" in levels
+        self.needs_target = any(level != 0 for level in levels)
+        if many:
+            bounds = [(gamma_min, gamma_max) if level == "adaptive" else (level, level) for level in levels]
+            for name, values in zip(("lower", "upper"), zip(*bounds, strict=True), strict=True):
+                self.register_buffer(name, torch.tensor(values, dtype=torch.get_default_dtype()), persistent=False)
 
     @property
-    def fixed_gamma(self) -> float | None:
-        """The fixed level, None where it is adaptive."""
-        return None if isinstance(self.gamma_mix, str) else float(self.gamma_mix)
+    def bounds(self) -> tuple[float, float] | tuple[Tensor, Tensor]:
+        """Bounds of the adaptive level, floats or ``[S]``. A fixed level is an adaptive one between equal bounds."""
+        if self.members:
+            return self.lower, self.upper
+        level = self.levels[0]
+        return (self.gamma_min, self.gamma_max) if level == "adaptive" else (float(level), float(level))
 
     def forward(
         self, dist: torch.distributions.Distribution, target_log_prob: Tensor | None, moment: Tensor
     ) -> Reference:
         """See :meth:`ReferenceDensity.forward`."""
-        if self.fixed_gamma is None:
-            gamma = adaptive_gamma(moment, self.gamma_min, self.gamma_max)
+        lower, upper = self.bounds
+        if isinstance(lower, Tensor):
+            # A fixed level stays where the moment is NaN.
+            gamma = lower.where(lower == upper, adaptive_gamma(moment, lower, upper))
+        elif lower == upper:
+            gamma = torch.full_like(moment, lower)
         else:
-            gamma = torch.full_like(moment, self.fixed_gamma)
+            gamma = adaptive_gamma(moment, lower, upper)
         if target_log_prob is None:
-            return Reference(torch.zeros_like(gamma), gamma)
-        return Reference(log_mixture(target_log_prob, gamma), gamma)
+            return Reference(moment.new_zeros(()), gamma)
+        return Reference(log_mixture(target_log_prob, per_sample(gamma, target_log_prob)), gamma)

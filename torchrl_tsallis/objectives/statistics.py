@@ -6,30 +6,55 @@ import torch
 from torch import Tensor
 
 
-def rating_statistics(weights: Tensor, mask: Tensor | None = None) -> dict[str, Tensor]:
+def masked_mean(x: Tensor, mask: Tensor | None = None, members: bool = False) -> Tensor:
+    """Mean over the valid samples, of each member by itself where there are members.
+
+    Args:
+        x: ``[*B]``, or ``[S, *B]`` with members.
+        mask: valid samples, bool, of the same shape; what it leaves out is selected away and may be NaN.
+        members: whether the first dimension is that of the members.
+
+    Returns:
+        A scalar, or ``[S]``; 0 where no sample is valid.
+
+    Examples:
+        >>> masked_mean(torch.tensor([[1.0, 3.0], [5.0, 5.0]]), members=True)
+        tensor([2., 5.])
+    """
+    if mask is None:
+        return x.flatten(1).mean(1) if members else x.mean()
+    x = x.where(mask, 0.0)
+    if members:
+        return x.flatten(1).sum(1) / mask.flatten(1).sum(1).clamp_min(1)
+    return x.sum() / mask.sum().clamp_min(1)
+
+
+def rating_statistics(weights: Tensor, mask: Tensor | None = None, members: bool = False) -> dict[str, Tensor]:
     r"""Mean, variance and effective sample size of the ratings of a batch.
 
     .. math:: \mathrm{ess} = \left(\sum_i \rho_i\right)^2 / \sum_i \rho_i^2
 
     Args:
-        weights: ratings, ``[*B]``, not negative.
-        mask: valid samples, ``[*B]`` bool. Default: all of them.
+        weights: ratings, ``[*B]``, or ``[S, *B]`` with members; not negative.
+        mask: valid samples, bool, of the same shape. Default: all of them.
+        members: whether the first dimension is that of the members, which have statistics of their own.
 
     Returns:
-        ``rating_mean``, ``rating_var`` (biased) and ``ess`` (in samples; 0 if every weight is 0), scalars.
+        ``rating_mean``, ``rating_var`` (biased) and ``ess`` (in samples; 0 if every weight is 0), scalars or ``[S]``.
 
     Examples:
         >>> {k: round(v.item(), 4) for k, v in rating_statistics(torch.tensor([1.0, 1.0, 0.0, 0.0])).items()}
         {'rating_mean': 0.5, 'rating_var': 0.25, 'ess': 2.0}
     """
     # Squares of ratings of up to exp(64) leave float32's range, not float64's.
-    wide = weights.double()
-    count: Tensor | int = weights.numel()
+    wide = weights.double().flatten(int(members))
+    count: Tensor | int = wide.shape[-1]
     if mask is not None:
-        wide = torch.where(mask, wide, 0.0)
-        count = mask.sum().clamp_min(1)
-    total = wide.sum()
-    squares = wide.square().sum()
+        mask = mask.flatten(int(members))
+        wide = wide.where(mask, 0.0)
+        count = mask.sum(-1).clamp_min(1)
+    total = wide.sum(-1)
+    squares = wide.square().sum(-1)
     mean = total / count
     ess = total.square() / squares.clamp_min(torch.finfo(wide.dtype).tiny)
     var = (squares / count - mean.square()).clamp(0, torch.finfo(weights.dtype).max)

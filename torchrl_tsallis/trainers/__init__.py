@@ -7,11 +7,14 @@ from torchrl_tsallis.trainers.hooks import EvaluationHook
 from torchrl_tsallis.trainers.logging import LoggerGroup, make_logger
 from torchrl_tsallis.trainers.offline import GuardedStepper, OfflineClock, SampleHook, make_offline_trainer
 from torchrl_tsallis.trainers.q_tuner import QTuner, q_gradient, q_objective, q_of_phi
+from torchrl_tsallis.trainers.stacked import LogMembers, MemberStepper
 
 __all__ = [
     "EvaluationHook",
     "GuardedStepper",
+    "LogMembers",
     "LoggerGroup",
+    "MemberStepper",
     "OfflineClock",
     "QTuner",
     "SampleHook",

@@ -21,6 +21,7 @@ from torchrl.record.loggers.common import Logger
 from torchrl.trainers import DefaultOptimizationStepper, Trainer, TrainerHookBase
 
 from torchrl_tsallis.trainers.q_tuner import QTuner
+from torchrl_tsallis.trainers.stacked import LogMembers, MemberStepper
 
 
 class OfflineClock:
@@ -214,6 +215,7 @@ def make_offline_trainer(
             raise ValueError(f"{name}={value} must be a positive multiple of {log_every=}: change one of the two")
     if getattr(loss, "needs_target", False) and updater is None:
         raise ValueError("the loss has a target network that nothing updates: pass updater=CATSoftUpdate(loss)")
+    members = getattr(loss, "num_members", None)
     rotation = None if checkpoint_dir is None else CheckpointRotation(checkpoint_dir, keep_last=keep_checkpoints)
     trainer = Trainer(
         collector=OfflineClock(log_every),
@@ -222,7 +224,7 @@ def make_offline_trainer(
         optim_steps_per_batch=log_every,
         loss_module=loss,
         optimizer=optimizer,
-        optimization_stepper=GuardedStepper(max_skips),
+        optimization_stepper=GuardedStepper(max_skips) if members is None else MemberStepper(max_skips),
         target_net_updater=updater,
         logger=logger,
         log_interval=0,
@@ -238,6 +240,8 @@ def make_offline_trainer(
         trainer.register_op("post_optim", updater.step)
     if tuner is not None:
         tuner.register(trainer)
+    if members is not None:
+        LogMembers().register(trainer)
     trainer.register_module("rng", GlobalRNGState())
     trainer.register_op("setup", _show_resumed(trainer))
     return trainer

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
@@ -73,9 +73,10 @@ def q_gradient(
     *,
     q_min: float = 0.6,
     multiplier: float = 100.0,
-    gamma_min: float = 0.1,
-    gamma_max: float = 0.9,
+    gamma_min: float | Tensor = 0.1,
+    gamma_max: float | Tensor = 0.9,
     gamma: float | Tensor | None = None,
+    mask: Tensor | None = None,
 ) -> tuple[Tensor, Tensor]:
     r"""Value and derivative of :func:`q_objective`, written out: a third of autograd's cost.
 
@@ -89,9 +90,10 @@ def q_gradient(
         phi: as there.
         q_min: as there.
         multiplier: as there.
-        gamma_min: as there.
+        gamma_min: as there, or ``[*S]`` together with the other one. A fixed gamma is one between equal bounds.
         gamma_max: as there.
         gamma: as there.
+        mask: valid samples, ``[*S, B]`` bool. Default: all of them.
 
     Returns:
         The objective and its derivative with respect to phi, ``[*S]`` each, without graph.
@@ -106,10 +108,15 @@ def q_gradient(
         u = (1 - share).mul_(1 - q_min)  # 1 - q
         exponent = u.unsqueeze(-1) * log_prob
         density = exponent.clamp(max=MAX_EXPONENT).exp_()
-        moment = density.mean(-1)
-        slope = -density.mul_(log_prob).where(exponent <= MAX_EXPONENT, 0.0).mean(-1)
+        if mask is None:
+            moment = density.mean(-1)
+            slope = -density.mul_(log_prob).where(exponent <= MAX_EXPONENT, 0.0).mean(-1)
+        else:
+            count = mask.sum(-1).clamp_min(1)
+            moment = density.where(mask, 0.0).sum(-1) / count
+            slope = -density.mul_(log_prob).where(mask & (exponent <= MAX_EXPONENT), 0.0).sum(-1) / count
         if gamma is None:
-            rest = moment.clamp(1 - gamma_max, 1 - gamma_min)  # 1 - gamma
+            rest = moment.clamp(1 - gamma_max, 1 - gamma_min)  # type: ignore[arg-type]  # 1 - gamma
             slope = slope.where(rest != moment, 0.0)
         else:
             rest = torch.as_tensor(1 - gamma, dtype=moment.dtype, device=moment.device)
@@ -133,10 +140,13 @@ class QTuner(TrainerHookBase):
     step size   lr           1e-3     as the policy's
     ==========  ===========  =======  ============
 
+    With S stacked members there is one phi for each, ``[S]``; ``tuned`` says whose q moves.
+
     Args:
         loss: the loss whose q is tuned. Its q becomes the middle of (q_min, 1).
 
     Keyword Args:
+        tuned (sequence of bool): the stacked members whose q is tuned; the q of the others stays. Default: None, all.
         q_min (float): lower bound of q. Default: 0.6.
         multiplier (float): Lagrange multiplier lambda. Default: 100.
         lr (float): step size of the tuner's own AdaTerm. Default: 1e-3.
@@ -162,6 +172,7 @@ class QTuner(TrainerHookBase):
         self,
         loss: TsallisBCLoss,
         *,
+        tuned: Sequence[bool] | None = None,
         q_min: float = 0.6,
         multiplier: float = 100.0,
         lr: float = 1e-3,
@@ -172,7 +183,12 @@ class QTuner(TrainerHookBase):
         if multiplier < 0:
             raise ValueError(f"multiplier must not be negative, got {multiplier}")
         reference = loss.reference
-        if not isinstance(reference, MixtureReference) or reference.fixed_gamma == 1:
+        if tuned is not None and len(tuned) != loss.num_members:
+            raise ValueError(f"tuned has {len(tuned)} values for {loss.num_members or 'no'} stacked members")
+        switches = tuned or [True] * (loss.num_members or 1)
+        if not isinstance(reference, MixtureReference) or any(
+            level == 1 and on for level, on in zip(reference.levels, switches, strict=True)
+        ):
             raise ValueError(
                 "QTuner needs a loss with the paper's mixture and gamma_mix < 1: eq. 15 divides by 1 - gamma; "
                 "use a fixed q with other references"
@@ -181,32 +197,39 @@ class QTuner(TrainerHookBase):
         self.reference = reference
         self.q_min = q_min
         self.multiplier = multiplier
+        self.tuned = None if tuned is None or all(tuned) else torch.tensor(tuned, device=loss.q.device)
         self.phi = nn.Parameter(torch.zeros_like(loss.q))
-        self.optimizer = optimizer([self.phi]) if optimizer else AdaTerm([self.phi], lr=lr)
+        self.optimizer = optimizer([self.phi]) if optimizer else AdaTerm([self.phi], lr=lr, batch_dims=self.phi.ndim)
         self._write_q()
 
     def _write_q(self) -> None:
         with torch.no_grad():
-            self.loss.q.copy_(q_of_phi(self.phi, self.q_min))
+            q = q_of_phi(self.phi, self.q_min)
+            self.loss.q.copy_(q if self.tuned is None else q.where(self.tuned, self.loss.q))
 
     def step(self, log_prob: Tensor | None = None) -> Tensor:
         """One step of the tuner.
 
         Args:
-            log_prob: log-densities of a batch, ``[N]``. Default: those of the loss's last ``forward``.
+            log_prob: log-densities of a batch, ``[N]``; ``[S, N]`` with members. Default: those of the loss's last
+                ``forward``.
 
         Returns:
-            The objective before the step, a detached scalar.
+            The objective before the step, a detached scalar; ``[S]`` with members, 0 where q is not tuned.
         """
-        objective, self.phi.grad = q_gradient(
+        gamma_min, gamma_max = self.reference.bounds
+        objective, slope = q_gradient(
             self.loss.last_log_prob if log_prob is None else log_prob.detach(),
             self.phi,
             q_min=self.q_min,
             multiplier=self.multiplier,
-            gamma_min=self.reference.gamma_min,
-            gamma_max=self.reference.gamma_max,
-            gamma=self.reference.fixed_gamma,
+            gamma_min=gamma_min,
+            gamma_max=gamma_max,
+            mask=self.loss.last_mask if log_prob is None else None,
         )
+        if self.tuned is not None:
+            objective, slope = objective.where(self.tuned, 0.0), slope.where(self.tuned, 0.0)
+        self.phi.grad = slope
         self.optimizer.step()
         self._write_q()
         return objective
