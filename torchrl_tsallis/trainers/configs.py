@@ -39,7 +39,6 @@ from typing import Any
 
 from hydra.core.config_store import ConfigStore
 from omegaconf import MISSING
-from torch import nn
 from torchrl.trainers import Trainer
 from torchrl.trainers.algorithms.configs.common import ConfigBase
 from torchrl.trainers.algorithms.configs.objectives import LossConfig, TargetNetUpdaterConfig
@@ -117,6 +116,7 @@ class AdaTermConfig(ConfigBase):
 class QTunerConfig(ConfigBase):
     """Configuration of :class:`~torchrl_tsallis.QTuner`, a partial that waits for the loss."""
 
+    tuned: list[bool] | None = None
     q_min: float = 0.6
     multiplier: float = 100.0
     lr: float = 1e-3
@@ -154,7 +154,7 @@ class OfflineTrainerConfig(ConfigBase):
 
 def make_loss(actor_network: Any, **settings: Any) -> TsallisBCLoss:
     """Builds the loss; the actor may come as a partial, as TorchRL's model configurations give it."""
-    return TsallisBCLoss(actor_network if isinstance(actor_network, nn.Module) else actor_network(), **settings)
+    return TsallisBCLoss(actor_network() if isinstance(actor_network, partial) else actor_network, **settings)
 
 
 def make_trainer(
