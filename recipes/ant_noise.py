@@ -12,6 +12,7 @@ Methods, tasks and seeds are overrides, one or a list; ``resume=true`` continues
 
 from __future__ import annotations
 
+import json
 import shutil
 import time
 from functools import partial
@@ -79,6 +80,21 @@ def unit_logger(unit: Unit, cfg: DictConfig) -> LoggerGroup:
     task, _, method = unit
     folder = folder_of(unit, cfg)
     return make_logger(cfg.logger, folder.parent, method, group=f"{task}/{method}", tags=[task, method])
+
+
+def check_settings(units: list[Unit], cfg: DictConfig) -> None:
+    """Keeps each training's settings in its folder; a resumed one must have the same."""
+    names = ("policy", "loss", "tuner", "optimizer", "updater", "epochs", "batch_size", "data", "evaluation")
+    every = OmegaConf.to_container(cfg, resolve=True)
+    for unit in units:
+        file = folder_of(unit, cfg) / "settings.json"
+        wanted = json.loads(json.dumps({name: every[name] for name in names} | every["methods"][unit[2]]))
+        before = json.loads(file.read_text()) if file.exists() else wanted
+        changed = [name for name in wanted if before.get(name) != wanted[name]]
+        if changed:
+            raise SystemExit(f"{file} was made with other {', '.join(changed)}: choose another output, or resume=false")
+        with atomic_path(file) as path:
+            path.write_text(json.dumps(wanted, indent=1))
 
 
 def train(unit: Unit, cfg: DictConfig) -> None:
@@ -150,6 +166,7 @@ def main(cfg: DictConfig) -> None:
     if not cfg.resume:
         for folder in folders.values():
             shutil.rmtree(folder, ignore_errors=True)
+    check_settings(units, cfg)
     experts, _ = demonstrations(cfg, cfg.progress)
     validate_demonstrations(experts, action_limit=1.0 if cfg.data.clip else 1.0 + 6.0 * cfg.data.std)
     try:
@@ -162,9 +179,9 @@ def main(cfg: DictConfig) -> None:
         raise SystemExit("interrupted: the same command with resume=true goes on from the last checkpoint") from None
     rows = [row for folder in folders.values() for row in read_returns(folder / "returns.csv")]
     save_returns(cfg.results, rows)
-    text = report(rows, Path(cfg.output), cfg.logger)
+    text = report(rows, Path(cfg.output), Path(cfg.pictures), cfg.logger)
     minutes = (time.monotonic() - start) / 60
-    print(f"\n{text}\n{minutes:.1f} minutes; returns in {cfg.results}, pictures in {cfg.output}")
+    print(f"\n{text}\n{minutes:.1f} minutes; returns in {cfg.results}, pictures in {cfg.pictures}")
 
 
 if __name__ == "__main__":

@@ -75,6 +75,7 @@ def summarise(rows: Sequence[Mapping[str, Any]], output: Path) -> list[dict[str,
             line = {"task": task, "method": method, "median": f"{interval['value']:.0f}"}
             line["95 % interval"] = f"{interval['low']:.0f} to {interval['high']:.0f} ({interval['unit']}s)"
             line |= {"IQM": f"{iqm(returns):.0f}", "episodes": f"{returns.shape[0]} x {returns.shape[1]}"}
+            line["median of each seed"] = ", ".join(f"{median(seed):.0f}" for seed in returns)
             for kind in ("noisy", "amateur"):
                 found = [score[kind] for score in scores if kind in score]
                 line[f"AUROC {kind}"] = f"{np.mean(found):.3f}" if found else "-"
@@ -100,43 +101,43 @@ def read_scalars(folder: Path, name: str) -> dict[int, float]:
         return {int(step): float(value) for step, value in csv.reader(file)}
 
 
-def save_plots(rows: Sequence[Mapping[str, Any]], output: Path) -> list[Path]:
+def save_plots(rows: Sequence[Mapping[str, Any]], output: Path, pictures: Path) -> list[Path]:
     """Pictures of each task: returns over all seeds; ratings, schedules and detection of the first seed."""
     paths = []
     for task in dict.fromkeys(row["task"] for row in rows):
         first = min(row["seed"] for row in rows if row["task"] == task)
         returns = by_method(rows, task)
         folders = {method: output / task / f"seed_{first}" / method for method in returns}
-        paths.append(return_by_method(returns, output / f"returns_{task}.png", title=f"Ant, task '{task}'"))
+        paths.append(return_by_method(returns, pictures / f"returns_{task}.png", title=f"Ant, task '{task}'"))
         curves: dict[str, Any] = {}
         for method, folder in folders.items():
             q, gamma = (read_scalars(folder, name) for name in ("q", "gamma_mix"))
             if q and gamma:
                 curves[method] = {"step": list(q), "q": list(q.values()), "gamma": [gamma[step] for step in q]}
         if curves:
-            paths.append(schedule(curves, output / f"schedule_{task}.png", title=f"task '{task}', seed {first}"))
+            paths.append(schedule(curves, pictures / f"schedule_{task}.png", title=f"task '{task}', seed {first}"))
         scores = {method: detection(folder) for method, folder in folders.items()}
         bars = {f"{method}\n{kind}": value for method, score in scores.items() for kind, value in score.items()}
         if bars:
-            paths.append(auroc_bars(bars, output / f"auroc_{task}.png", title=f"task '{task}', seed {first}"))
+            paths.append(auroc_bars(bars, pictures / f"auroc_{task}.png", title=f"task '{task}', seed {first}"))
         for method, folder in folders.items():
             file = load_file(folder / "ratings.safetensors")
             ratings = {kind: file["rating"][file[kind]] for kind in ("clean", "noisy", "amateur") if kind in file}
             if np.ptp(file["rating"]) > 0:  # plain BC rates every sample 1
-                name = output / f"rating_{task}_{method}.png"
+                name = pictures / f"rating_{task}_{method}.png"
                 paths.append(rating_histogram(ratings, name, title=f"{method}, task '{task}', seed {first}"))
     return paths
 
 
-def report(rows: Sequence[Mapping[str, Any]], output: Path, kind: str) -> str:
+def report(rows: Sequence[Mapping[str, Any]], output: Path, pictures: Path, kind: str) -> str:
     """Writes ``table.md`` and the pictures, logs them as a run named summary, and returns the table's text."""
     table = summarise(rows, output)
     text = as_markdown(table)
-    with atomic_path(output / "table.md") as path:
+    with atomic_path(pictures / "table.md") as path:
         path.write_text(text, encoding="utf-8")
     logger = make_logger(kind, output, "summary", group="summary")
     logger.log_table("results", table)
-    for picture in save_plots(rows, output):
+    for picture in save_plots(rows, output, pictures):
         logger.log_picture(picture.stem, picture)
     logger.shutdown()
     return text

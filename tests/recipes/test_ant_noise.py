@@ -96,6 +96,12 @@ def test_an_interrupted_job_goes_on_to_the_same_weights(unbroken, tmp_path, sign
     assert steps[-1] == 80 * 7 and len(set(steps)) == 80
 
 
+def test_resuming_with_other_settings_is_refused(unbroken):
+    process = start(unbroken[0], "resume=true", "loss.gamma_min=0.2", "evaluation.episodes=3")
+    _, err = process.communicate(timeout=60)
+    assert process.returncode == 1 and "was made with other loss, evaluation" in err
+
+
 @pytest.mark.parametrize(
     ("override", "message"),
     [
