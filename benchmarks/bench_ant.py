@@ -27,7 +27,7 @@ from torchrl_tsallis.evaluation.episodes import make_environment, run_episodes
 from torchrl_tsallis.evaluation.rollouts import GROUP
 from torchrl_tsallis.modules import make_policy
 
-REPEATS, STEPS, SEED = 7, 1000, 10_000
+REPEATS, STEPS, SEED = 5, 1000, 10_000
 
 
 class Alone:

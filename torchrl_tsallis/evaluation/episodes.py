@@ -94,18 +94,18 @@ def run_episodes(policy: Policy, envs: Sequence[Any], seeds: Sequence[int]) -> l
             actions: Any = []
             if batched:
                 slot = running[0]
-                actions = np.asarray(policy(np.stack([observations[slot] for slot in running])))
+                actions = np.asarray(policy(np.array([observations[slot] for slot in running])))
             else:
                 for slot in running:
                     actions.append(np.asarray(policy(observations[slot])))
-            # The second test looks at all actions at once, for speed.
+            # The second test looks at all actions at once, for speed, as does the clipping, which is np.clip's.
             if any(action.shape != low.shape for action in actions) or not np.isfinite(actions).all():
                 for slot, action in zip(running, actions, strict=True):
                     if action.shape != low.shape or not np.isfinite(action).all():
                         raise ValueError(
                             f"step {lengths[slot]}: need a finite action of shape {low.shape}, got {action}"
                         )
-            clipped = np.clip(actions, low, high).astype(low.dtype)
+            clipped = np.minimum(np.maximum(actions, low), high).astype(low.dtype, copy=False)
             over = []
             for slot, action in zip(running, clipped, strict=True):
                 observations[slot], reward, terminated, truncated, _ = envs[slot].step(action)

@@ -20,8 +20,8 @@ from torchrl_tsallis.evaluation.mean_policy import MeanPolicy
 
 Task = tuple[str, int]
 DEFAULT_ENV = "torchrl_tsallis.envs:make_ant"
-#: Most episodes that a worker steps in turn: fewer batch the policy less, more do not fit the processor's caches.
-GROUP = 8
+#: Most episodes that a worker steps in turn: fewer batch the policy less, more crowd the processor's caches.
+GROUP = 4
 _THREADS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
 _WORKER: dict[str, Any] = {}
 
@@ -36,7 +36,7 @@ def evaluate_policies(
     retries: int = 2,
     progress: bool = True,
 ) -> list[dict[str, Any]]:
-    """Runs every policy on the same seeds in worker processes, each of which steps up to 8 environments in turn.
+    """Runs every policy on the same seeds in worker processes, each of which steps up to 4 environments in turn.
 
     A worker uses its environments again, so an episode must depend on the seed of ``reset`` alone once an environment
     was reset before. The Ant's does; its physics is restored bit for bit.
