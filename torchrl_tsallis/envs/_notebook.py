@@ -47,9 +47,9 @@ def _shapes(x: float, z: float, size: tuple[float, float, float]) -> str:
 def notebook_urdf() -> str:
     """The notebook as one multibody: a base and pages x segments revolute joints.
 
-    The base's right half, up to the ring's height, stands for the sheets that stay; the left half, 6 mm lower, is the
-    desk on which the flipped pages' edges rest. The page of index 0 lies at the bottom of the closed stack. Lines are
-    broken, because Bullet's parser needs it.
+    The base is a desk, on which the flipped pages' edges rest, and on its right a block for the sheets that stay, 6 mm
+    high up to the ring. The page of index 0 lies at the bottom of the closed stack. Lines are broken, because Bullet's
+    parser needs it.
 
     Examples:
         >>> notebook_urdf().count("<joint")
@@ -57,7 +57,7 @@ def notebook_urdf() -> str:
     """
     parts = ['<?xml version="1.0"?>\n<robot name="notebook">\n<link name="base">\n']
     parts += [_inertial(1.0, 0.0, (1.0, 1.0, 0.01))]
-    parts += [_shapes(0.06, -0.006, (0.12, 0.17, 0.012)), _shapes(-0.06, -0.009, (0.12, 0.17, 0.006)), "</link>\n"]
+    parts += [_shapes(0.054, -0.003, (0.108, 0.15, 0.006)), _shapes(0.0, -0.016, (0.8, 0.8, 0.02)), "</link>\n"]
     strip = (LENGTH, WIDTH, THICKNESS)
     for page in range(PAGES):
         low, high = MARGIN + page * SPREAD, math.pi - MARGIN - (PAGES - 1 - page) * SPREAD
@@ -99,7 +99,8 @@ class Notebook:
             )
             client.changeVisualShape(self.body, joint, rgbaColor=COLOURS[joint // SEGMENTS % 2])
         client.changeDynamics(self.body, -1, lateralFriction=FRICTION, restitution=0.0)
-        client.changeVisualShape(self.body, -1, rgbaColor=(0.35, 0.27, 0.22, 1.0))
+        for shape, colour in enumerate(((0.35, 0.27, 0.22, 1.0), (0.78, 0.72, 0.64, 1.0))):
+            client.changeVisualShape(self.body, -1, shapeIndex=shape, rgbaColor=colour)
         self.curl = 0.1  # rad, rest angle of a bend
         self.stiffness = 0.01  # N m/rad, of a bend
         self.angles = np.zeros((PAGES, SEGMENTS))
