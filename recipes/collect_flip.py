@@ -31,8 +31,8 @@ from torchrl_tsallis.evaluation.flip_plots import force_over_time
 SOURCES = (_arm, _notebook, _flip_world, page_flip, flips, teleoperation, flip_demonstrations)
 
 
-def record(job: tuple[int, int], steps: int, replay: bool) -> tuple[TensorDict, dict[str, Any]]:
-    """Records one trajectory, in a worker process."""
+def record(job: tuple[int, int], steps: int, replay: bool) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    """Records one trajectory, in a worker process; as arrays, because each shared tensor would hold a file open."""
     episode, seed = job
     torch.set_num_threads(1)
     data, facts = record_flips(make_page_flip, seed=seed, steps=steps)
@@ -41,7 +41,7 @@ def record(job: tuple[int, int], steps: int, replay: bool) -> tuple[TensorDict, 
         observations, again = replay_forces(make_page_flip, data["action"], seed=seed)
         error = np.abs(observations - data["next", "observation"].numpy())[:, :3].max()
         facts |= {"replayed": again.total, "replay_error": float(error)}
-    return data, facts
+    return {key: value.numpy() for key, value in data.flatten_keys(".").items()}, facts
 
 
 def collect_flips(
@@ -79,7 +79,9 @@ def collect_flips(
             bar = tqdm(results, total=len(jobs), desc="recording demonstrations", disable=not progress)
             parts, facts = zip(*bar, strict=True)
         metadata = {"seed": seed, "steps": steps, "rate_hz": 50, "trajectories": facts}
-        save_demonstrations(file, torch.cat(parts), metadata)
+        columns = {key: torch.from_numpy(np.concatenate([part[key] for part in parts])) for key in parts[0]}
+        data = TensorDict(columns, [trajectories * steps]).unflatten_keys(".")
+        save_demonstrations(file, data, metadata)
     return load_demonstrations(file)
 
 

@@ -18,7 +18,7 @@ SUBSTEPS = 10  # physics steps a command: 50 Hz
 START = (0.125, 0.0, 0.04)  # m, of the tip
 START_NOISE = 0.005  # m, standard deviation
 SETTLE, SETTLE_RESET = 300, 150  # physics steps
-CAMERA = {"cameraEyePosition": (0.05, -0.42, 0.22), "cameraTargetPosition": (0.045, 0.0, 0.07)}  # m
+CAMERA = {"cameraEyePosition": (0.05, -0.46, 0.24), "cameraTargetPosition": (0.045, 0.0, 0.085)}  # m
 
 
 class _Client:
@@ -97,7 +97,7 @@ class FlipWorld:
         """Draws the scene by the software renderer, ``[height, width, 3]`` uint8."""
         client = self.client
         view = client.computeViewMatrix(**CAMERA, cameraUpVector=(0.0, 0.0, 1.0))
-        projection = client.computeProjectionMatrixFOV(36.0, width / height, 0.05, 2.0)
+        projection = client.computeProjectionMatrixFOV(39.0, width / height, 0.05, 2.0)
         image = client.getCameraImage(
             width, height, view, projection, lightDirection=(0.3, -0.8, 1.0), renderer=client.ER_TINY_RENDERER
         )[2]
