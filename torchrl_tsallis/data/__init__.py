@@ -9,12 +9,15 @@ from torchrl_tsallis.data.demonstrations import (
     save_demonstrations,
     validate_demonstrations,
 )
+from torchrl_tsallis.data.flip_demonstrations import record_flips, replay_forces
 from torchrl_tsallis.data.policy import NumpyPolicy, load_policy
 from torchrl_tsallis.data.replay import make_replay_buffer
 from torchrl_tsallis.data.stacked import MemberSampler, make_stacked_replay_buffer
+from torchrl_tsallis.data.teleoperation import FlipOperator
 
 __all__ = [
     "TASKS",
+    "FlipOperator",
     "MemberSampler",
     "NumpyPolicy",
     "add_action_noise",
@@ -23,8 +26,10 @@ __all__ = [
     "make_replay_buffer",
     "make_stacked_replay_buffer",
     "make_task",
+    "record_flips",
     "record_trajectory",
     "replace_with_amateur",
+    "replay_forces",
     "save_demonstrations",
     "validate_demonstrations",
 ]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from torchrl_tsallis.evaluation.flip_plots import force_over_time
 from torchrl_tsallis.evaluation.mean_policy import MeanPolicy
 from torchrl_tsallis.evaluation.plots import auroc_bars, rating_histogram, return_by_method, schedule
 from torchrl_tsallis.evaluation.rollouts import evaluate_policies
@@ -14,6 +15,7 @@ __all__ = [
     "auroc_bars",
     "bootstrap_interval",
     "evaluate_policies",
+    "force_over_time",
     "iqm",
     "median",
     "probability_of_improvement",
