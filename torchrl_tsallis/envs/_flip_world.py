@@ -11,7 +11,7 @@ import numpy as np
 
 from torchrl_tsallis.envs._arm import FORCE_LIMIT, GRAVITY, Arm, arm_urdf
 from torchrl_tsallis.envs._notebook import Notebook, notebook_urdf
-from torchrl_tsallis.envs.ant import _quiet
+from torchrl_tsallis.envs._quiet import quiet
 
 RATE = 500  # Hz, physics and low-level loop
 SUBSTEPS = 10  # physics steps a command: 50 Hz
@@ -46,7 +46,7 @@ class FlipWorld:
     """
 
     def __init__(self) -> None:
-        with _quiet():
+        with quiet():
             self.client: Any = _Client()
             self.client.setGravity(0.0, 0.0, -GRAVITY)
             self.client.setPhysicsEngineParameter(
