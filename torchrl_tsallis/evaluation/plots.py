@@ -61,7 +61,7 @@ def return_by_method(returns: Mapping[str, ArrayLike], path: str | os.PathLike[s
     values = {name: _checked(v, f"returns[{name!r}]") for name, v in returns.items()}
     rng = np.random.default_rng(0)
     units = set()
-    with _figure(path, max(3.5, 1.1 * len(values) + 1)) as axes:
+    with _figure(path, max(4.2, 1.1 * len(values) + 1)) as axes:
         for i, array in enumerate(values.values()):
             colour = PALETTE[i % len(PALETTE)]
             flat = array.ravel()
@@ -212,7 +212,7 @@ def auroc_bars(values: Mapping[str, float], path: str | os.PathLike[str], *, tit
         bars = axes.bar(list(values), list(values.values()), color=colours, width=0.6)
         axes.bar_label(bars, fmt="%.3f", fontsize=8, padding=2)
         axes.axhline(0.5, color="black", linewidth=0.8, linestyle=":")
-        axes.annotate("chance", (1.0, 0.5), xycoords=("axes fraction", "data"), ha="right", va="bottom", fontsize=8)
+        axes.annotate("chance", (1.01, 0.5), xycoords=("axes fraction", "data"), va="center", fontsize=8)
         axes.set_ylim(0, 1.08)
         axes.set_ylabel("AUROC, clean above bad samples")
         axes.set_title(title)
