@@ -133,6 +133,7 @@ def card_row(name: str, source: str, cfg: DictConfig) -> str:
     """Copy a policy to where it is shipped, evaluate it, and describe it in a row of the card's table."""
     register_ant()
     env = gym.make(cfg.env_id, disable_env_checker=True)
+    env.reset(seed=0)  # the first episode of a fresh PyBullet environment starts unlike all later ones
     with safe_open(source, "pt") as file:
         tensors, meta = {k: file.get_tensor(k) for k in file.keys()}, dict(file.metadata())  # noqa: SIM118
     with atomic_path(Path(cfg.card.policies_dir) / f"{name}.safetensors") as path:
@@ -171,7 +172,7 @@ mode.
 
 {cfg.card.history}
 
-The amateur is an early snapshot of a run: it keeps standing and moves slowly. The policies are meant for recording
+The amateur keeps standing and moves slowly. The policies are meant for recording
 demonstrations in simulation and comparing imitation learners; they are not fit to drive a real robot.
 """
 
