@@ -13,7 +13,8 @@ class _RMSNorm(torch.autograd.Function):
 
     @staticmethod
     def forward(x: Tensor, weight: Tensor, eps: float) -> tuple[Tensor, Tensor, Tensor]:
-        inverse = x.square().mean(-1, keepdim=True).add_(eps).rsqrt_()
+        inverse = torch.linalg.vector_norm(x, dim=-1, keepdim=True)
+        inverse = inverse.square_().div_(x.shape[-1]).add_(eps).rsqrt_()
         unit = x * inverse
         return unit * weight, unit, inverse
 
