@@ -85,9 +85,8 @@ class Segments:
         """Mean over each segment of a vector ``[N]``, stacked, ``[S]``."""
         if self.single:
             return flat
-        dense = None if torch.compiler.is_compiling() else self.averages
-        if dense is not None and dense.dtype == flat.dtype and dense.device == flat.device:
-            means = dense.mv(flat)
+        if self.averages is not None and self.averages.dtype == flat.dtype and self.averages.device == flat.device:
+            means = self.averages.mv(flat)
             if math.isfinite(means.sum().item()):  # else 0 * inf may have carried one segment's trouble to the others
                 return means
         parts = flat.split(self.sizes)

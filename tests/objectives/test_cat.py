@@ -140,19 +140,6 @@ def test_pickled_with_its_loss_it_follows():
             assert torch.equal(a, b)
 
 
-def test_compiled_arithmetic_is_the_same():
-    losses = [_Loss([_net(0), _net(1)]) for _ in range(2)]
-    updaters = [CATSoftUpdate(loss) for loss in losses]
-    updaters[1].compile(backend="aot_eager", fullgraph=True)
-    for step in range(8):
-        for loss, updater in zip(losses, updaters, strict=True):
-            _move(loss, step)
-            updater.step()
-    for name in ("net_params", "target_net_params"):
-        for a, b in zip(*(_leaves(getattr(loss, name)) for loss in losses), strict=True):
-            torch.testing.assert_close(a, b, rtol=1e-10, atol=1e-14)
-
-
 def test_follows_the_data_type():
     loss = _Loss(_net().float())
     updater = CATSoftUpdate(loss)

@@ -170,19 +170,3 @@ def test_wrong_arguments(options, match):
         AdaTerm([torch.nn.Parameter(torch.ones(2))], **options)
     with pytest.raises(ValueError, match="float32 or float64"):
         AdaTerm([torch.nn.Parameter(torch.ones(2).half())])
-
-
-@pytest.mark.parametrize("options", [{}, {"amsgrad": 0.9, "uncentered": True}, {"adaptive_bias": True}], ids=str)
-def test_compiled_arithmetic_is_the_same(options):
-    gs = list(_grads([(3, 4, 2), (3, 5)], 12))
-    gs[6][0][1] = math.nan  # of one member
-    runs = []
-    for compiled in (False, True):
-        params = [torch.nn.Parameter(torch.ones(3, 4, 2).double()), torch.nn.Parameter(torch.ones(3, 5).double())]
-        optim = AdaTerm(params, batch_dims=1, **options)
-        if compiled:
-            optim.compile(backend="aot_eager", fullgraph=True)
-        _run(optim, params, gs)
-        runs.append([*params, *(x for p in params for x in optim.state[p].values())])
-    for a, b in zip(*runs, strict=True):
-        torch.testing.assert_close(a, b, rtol=1e-10, atol=1e-14)

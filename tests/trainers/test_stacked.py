@@ -241,22 +241,6 @@ def test_any_actor_can_be_stacked(chain):
         torch.testing.assert_close(out["member_loss"][k], expected["loss_tsallis_bc"].detach())
 
 
-def test_compiled_stacked_loss_is_the_same():
-    loss = TsallisBCLoss([make_actor(0), make_actor(1)], gamma_mix=["adaptive", 0.0]).double()
-    CATSoftUpdate(loss)
-    data = torch.stack([data_of(0), data_of(1)])
-    expected = loss(data)
-    expected["loss_tsallis_bc"].backward()
-    grads = [p.grad.clone() for p in loss.parameters()]
-    loss.zero_grad()
-    loss.compile(backend="aot_eager")
-    got = loss(data)
-    got["loss_tsallis_bc"].backward()
-    torch.testing.assert_close(got, expected)
-    torch.testing.assert_close([p.grad for p in loss.parameters()], grads)
-    assert loss.last_log_prob.shape == (2, 64)
-
-
 def test_errors_of_stacked_members():
     actors = [make_actor(0), make_actor(1)]
     with pytest.raises(ValueError, match="q has 3 values for 2 policies"):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any, Literal
 
 import torch
@@ -61,8 +61,6 @@ class CATSoftUpdate(TargetNetUpdater):
         >>> updater.step()
     """
 
-    _advance: Callable[..., None] | None = None
-
     def __init__(
         self,
         loss_module: LossModule,
@@ -92,14 +90,6 @@ class CATSoftUpdate(TargetNetUpdater):
             self.loss_module, self.initialized = loss_module, True
             self._target_names: list[str] = []
             self._source_names: list[str] = []
-
-    def compile(self, **options: Any) -> None:
-        """Compiles the arithmetic of a step, which pays for large or stacked parameters.
-
-        Args:
-            options: of ``torch.compile``.
-        """
-        self._advance = torch.compile(_Group.advance, **options)
 
     def init_(self) -> None:
         """Copies the parameters to the target and starts the state anew."""
@@ -175,33 +165,28 @@ class _Group:
         source, target, scale = self.source, self.target, self.state["scale"]
         if not self.buffers or scale.dtype != target[0].dtype or scale.device != target[0].device:
             self._prepare()
-        (d, d_views), (_, followed_views) = self.buffers
+        seg, eps, tau = self.segments, updater.eps, updater.tau
+        (d, d_views), (followed, followed_views) = self.buffers
         torch._foreach_copy_(d_views, source)
         torch._foreach_sub_(d_views, target)
-        if self.waiting:
-            self._start_scale(d.square().clamp_(max=torch.finfo(d.dtype).max / 16), updater.eps)
-        advance = updater._advance or _Group.advance
-        advance(self, updater.tau, updater.k, updater.eps)
-        torch._foreach_add_(target, followed_views)
-        if updater.strength:
-            if updater._pulled is not None and self.segments.batch_dims == 1:
-                for view in d_views:  # a member that is not rated by its target is left alone
-                    view[~updater._pulled.to(view.device)] = 0.0
-            torch._foreach_sub_(source, d_views, alpha=updater.strength)
-
-    def advance(self, tau: float, k: float, eps: float) -> None:
-        """Moves the state by the difference, and splits that into what is followed and what is refused."""
-        seg, v, nu = self.segments, self.state["scale"], self.state["nu"]
-        (d, _), (followed, _) = self.buffers
+        v, nu = self.state["scale"], self.state["nu"]
         d2 = d.square().clamp_(max=torch.finfo(d.dtype).max / 16)
+        if self.waiting:
+            self._start_scale(d2, eps)
         distance = seg.mean(d2 / v)
-        share, new_nu = robust_rate(distance, nu, tau, k, eps)
+        share, new_nu = robust_rate(distance, nu, tau, updater.k, eps)
         floor = floor_target(d2, v, seg.expand(distance), seg.expand(nu.reciprocal()), eps)
         rate = seg.expand(share.mul_(tau))
         v.addcmul_(rate, d2.add_(floor).sub_(v))
         nu.copy_(new_nu)
         torch.mul(rate, d, out=followed)
-        d.mul_(tau).sub_(followed)  # (tau - t) d
+        torch._foreach_add_(target, followed_views)
+        if updater.strength:  # strength (tau - t) d, by what was not followed
+            d.mul_(tau).sub_(followed)
+            if updater._pulled is not None and seg.batch_dims == 1:
+                for view in d_views:  # a member that is not rated by its target is left alone
+                    view[~updater._pulled.to(view.device)] = 0.0
+            torch._foreach_sub_(source, d_views, alpha=updater.strength)
 
     def views(self, name: str) -> dict[str, Tensor]:
         """Views of one entry of the state by dotted key."""

@@ -16,10 +16,6 @@ from torchrl_tsallis._student_t import floor_target, robust_rate
 __all__ = ["AdaTerm"]
 
 
-#: The options that the arithmetic of a step needs.
-_ARITHMETIC = ("lr", "betas", "eps", "k", "amsgrad", "uncentered", "adaptive_bias", "skip_nonfinite")
-
-
 class AdaTerm(Optimizer):
     r"""Adaptive moments estimated under Student's t, so that outlying gradients are damped.
 
@@ -75,8 +71,6 @@ class AdaTerm(Optimizer):
         True
     """
 
-    _advance: Callable[..., None] | None = None
-
     def __init__(
         self,
         params: Iterable[Any],
@@ -97,14 +91,6 @@ class AdaTerm(Optimizer):
         values = (betas, eps, k, weight_decay, amsgrad, uncentered, adaptive_bias, ini_dof)
         rest = {"lr": lr, "batch_dims": batch_dims, "skip_nonfinite": skip_nonfinite}
         super().__init__(params, {**rest, **dict(zip(names, values, strict=True))})
-
-    def compile(self, **options: Any) -> None:
-        """Compiles the arithmetic of a step, which pays for large or stacked parameters.
-
-        Args:
-            options: of ``torch.compile``.
-        """
-        self._advance = torch.compile(_Layout.advance, **options)
 
     def add_param_group(self, param_group: dict[str, Any]) -> None:
         """Adds a group of parameters with its own options, after checking them."""
@@ -149,7 +135,7 @@ class AdaTerm(Optimizer):
                 signature = (options, [id(p) for p in params])
                 if layout is None or layout.signature != signature:
                     layout = self._layouts[(index, kind)] = _Layout(self.state, group, params, signature)
-                layout.step(group, params, self._advance)
+                layout.step(group, params)
         return loss
 
 
@@ -211,22 +197,14 @@ class _Layout:
             for p, view in zip(params, views, strict=True):
                 state[p][name] = view
 
-    def step(self, group: dict[str, Any], params: list[Tensor], advance: Callable[..., None] | None = None) -> None:
-        """One update of the parameters from their gradients; ``advance`` is a compiled form of the method."""
-        torch._foreach_copy_(self.grad_views, [p.grad for p in params if p.grad is not None])
-        if group["weight_decay"]:
-            self.grad.add_(self.segments.flatten(params), alpha=group["weight_decay"])
-        if advance is None:
-            self.advance(group)
-        else:
-            advance(self, {name: group[name] for name in _ARITHMETIC})
-        torch._foreach_sub_(params, self.update_views)
-
-    def advance(self, group: dict[str, Any]) -> None:
-        """Moves the state by the gradient, and leaves what is subtracted from the parameters in ``update``."""
+    def step(self, group: dict[str, Any], params: list[Tensor]) -> None:
+        """One update of the parameters from their gradients."""
         seg, f, (beta1, beta2, beta_nu), eps = self.segments, self.flat, group["betas"], group["eps"]
         m, s, floor, nu = f["exp_avg"], f["exp_avg_sq"], f["floor"], f["nu"]
         d = self.grad
+        torch._foreach_copy_(self.grad_views, [p.grad for p in params if p.grad is not None])
+        if group["weight_decay"]:
+            d.add_(seg.flatten(params), alpha=group["weight_decay"])
         d.sub_(m)
         d2 = d.square().clamp_(max=self.limit)
         v = s + floor
@@ -235,10 +213,8 @@ class _Layout:
             ratio.addcmul_(d, self.zero)  # NaN where the gradient is not finite; d2 was clamped and no longer shows it
         distance = seg.mean(ratio)
         bad = None
-        # A sum of squares is NaN if one of them is. To read it back costs nothing on a CPU, and would stall a GPU or
-        # break a compiled graph.
-        blind = distance.device.type != "cpu" or torch.compiler.is_compiling()
-        if group["skip_nonfinite"] and (blind or math.isnan(distance.sum().item())):
+        # A sum of squares is NaN if one of them is. To read it back costs nothing on a CPU, and would stall a GPU.
+        if group["skip_nonfinite"] and (distance.device.type != "cpu" or math.isnan(distance.sum().item())):
             bad = distance.isnan()
         if bad is not None:
             distance = distance.masked_fill(bad, 0.0)
@@ -270,6 +246,7 @@ class _Layout:
         if bad is not None:
             scale, v = scale.masked_fill(bad, 0.0), v.clamp_(min=torch.finfo(v.dtype).tiny)
         torch.mul(seg.expand(scale), m, out=self.update).div_(v.sqrt_())
+        torch._foreach_sub_(params, self.update_views)
 
     def _bias_correction(self, group: dict[str, Any], share: Tensor, beta1: float, beta2: float) -> Tensor:
         """Returns ``sqrt(c2) / c1`` for the corrections c1, c2 of the two moments, ``[S]``."""
