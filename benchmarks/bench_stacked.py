@@ -20,10 +20,9 @@ from torchrl._utils import logger as torchrl_logger
 from torchrl.objectives import BCLoss
 
 from torchrl_tsallis import AdaTerm, CATSoftUpdate, QTuner, TsallisBCLoss
-from torchrl_tsallis._memory import keep_freed_memory
 from torchrl_tsallis.data import make_replay_buffer, make_stacked_replay_buffer
 from torchrl_tsallis.modules import make_policy
-from torchrl_tsallis.trainers import make_offline_trainer
+from torchrl_tsallis.trainers import keep_freed_memory, make_offline_trainer
 
 OBSERVATION, ACTION, HIDDEN, BATCH, ROWS = 28, 8, 100, 256, 29_970
 WEIGHTS = OBSERVATION * HIDDEN + HIDDEN * HIDDEN + HIDDEN * 2 * ACTION

@@ -147,8 +147,8 @@ def make_stacked_replay_buffer(
         >>> make_stacked_replay_buffer(data, seeds=[0, 1, 2], batch_size=4).sample()["action"].shape
         torch.Size([3, 4, 2])
     """
-    many = not isinstance(demonstrations, TensorDictBase)
-    members = list(demonstrations) if many else [demonstrations] * len(seeds)
+    shared = isinstance(demonstrations, TensorDictBase)
+    members: list[TensorDictBase] = [demonstrations] * len(seeds) if shared else list(demonstrations)
     unique = {id(member): member for member in members}
     rows, start = {}, 0
     for name, member in unique.items():

@@ -71,7 +71,7 @@ class RMSNorm(nn.RMSNorm):
     def forward(self, x: Tensor) -> Tensor:
         """Normalises ``[*B, size]``."""
         eps = torch.finfo(x.dtype).eps if self.eps is None else self.eps
-        weight = self.weight
+        weight: Tensor = self.weight
         if weight.ndim == 2:  # of stacked members, [S, size]
             weight = weight.view(len(weight), *[1] * (x.ndim - 2), -1)
         if torch.compiler.is_compiling():  # a compiler fuses the plain formula

@@ -10,9 +10,7 @@ from torch import Tensor
 from torchrl.trainers import OptimizationStepper, Trainer, TrainerHookBase
 
 
-def guard_member_grads(
-    params: list[Tensor], losses: Tensor, clip_norm: float | None = None
-) -> tuple[Tensor, Tensor]:
+def guard_member_grads(params: list[Tensor], losses: Tensor, clip_norm: float | None = None) -> tuple[Tensor, Tensor]:
     """Clips each member's gradient, and marks those of the members whose loss or gradient is not finite by NaN.
 
     Args:
@@ -79,8 +77,8 @@ class MemberStepper(OptimizationStepper):
         trainer.optimizer.zero_grad()
         if self.in_a_row > self.max_skips:
             raise FloatingPointError(
-                f"{self.in_a_row} steps in a row up to step {trainer._optim_count} had no member with a finite loss and "
-                "gradient: check the data by validate_demonstrations, or lower the learning rate"
+                f"{self.in_a_row} steps in a row up to step {trainer._optim_count} had no member with a finite loss "
+                "and gradient: check the data by validate_demonstrations, or lower the learning rate"
             )
         self.skipped = (torch.zeros_like(norm) if self.skipped is None else self.skipped.to(norm)) + ~good
         out["grad_norm"] = norm
