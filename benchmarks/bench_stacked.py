@@ -22,7 +22,7 @@ from torchrl.objectives import BCLoss
 from torchrl_tsallis import AdaTerm, CATSoftUpdate, QTuner, TsallisBCLoss
 from torchrl_tsallis.data import make_replay_buffer, make_stacked_replay_buffer
 from torchrl_tsallis.modules import make_policy
-from torchrl_tsallis.trainers import make_offline_trainer
+from torchrl_tsallis.trainers import keep_freed_memory, make_offline_trainer
 
 OBSERVATION, ACTION, HIDDEN, BATCH, ROWS = 28, 8, 100, 256, 29_970
 WEIGHTS = OBSERVATION * HIDDEN + HIDDEN * HIDDEN + HIDDEN * 2 * ACTION
@@ -82,6 +82,7 @@ def main() -> None:
     parser.add_argument("--compile", action="store_true", help="torch.compile the loss (takes a minute)")
     args = parser.parse_args()
     torch.set_num_threads(args.threads)
+    keep_freed_memory()  # of both kinds of runs
     warnings.simplefilter("ignore")  # BCLoss warns of its own annotations
     torchrl_logger.setLevel("ERROR")
     torch.manual_seed(0)

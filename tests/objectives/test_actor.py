@@ -11,7 +11,8 @@ from torch import nn
 from torchrl.modules import IndependentNormal, ProbabilisticActor
 
 from torchrl_tsallis.modules import make_policy
-from torchrl_tsallis.objectives.actor import get_dist
+from torchrl_tsallis.objectives import actor as actor_module
+from torchrl_tsallis.objectives.actor import get_dist, get_stacked_dist
 
 
 def inputs() -> TensorDict:
@@ -46,3 +47,14 @@ def test_a_hook_is_not_passed_over():
     actor.module[0].register_forward_hook(lambda *_: calls.append(1))
     get_dist(actor, inputs())
     assert calls == [1]
+
+
+def test_stackable_modules_give_what_vmap_gives(monkeypatch):
+    actors = [make_policy(3, 2, hidden=(8,)) for _ in range(3)]
+    params = TensorDict.from_modules(*actors, as_module=True)
+    data, action = TensorDict({"observation": torch.randn(3, 5, 3)}, [3, 5]), torch.randn(3, 5, 2)
+    by_products = get_stacked_dist(actors[0], data, params).log_prob(action)
+    monkeypatch.setattr(actor_module, "_is_stackable", lambda module: False)
+    torch.testing.assert_close(get_stacked_dist(actors[0], data, params).log_prob(action), by_products)
+    solo = torch.stack([a.get_dist(row).log_prob(x) for a, row, x in zip(actors, data, action, strict=True)])
+    torch.testing.assert_close(by_products, solo)

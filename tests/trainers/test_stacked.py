@@ -147,7 +147,7 @@ def test_a_bad_member_neither_stops_nor_changes_the_others():
     good.train(), bad.train()
     for k in (0, 2):
         for name, value in good.loss_module.member_state_dict(k).items():
-            assert torch.equal(value, bad.loss_module.member_state_dict(k)[name])
+            torch.testing.assert_close(value, bad.loss_module.member_state_dict(k)[name], rtol=1e-9, atol=1e-12)
     for name, value in bad.loss_module.member_state_dict(1).items():
         torch.testing.assert_close(value, start[name])  # CAT-soft's first pull is none: the target is where it was
     assert bad.optimization_stepper.skipped.tolist() == [0, 24, 0]
@@ -212,9 +212,8 @@ def test_target_network_iff_a_member_needs_it_and_pull_only_where_it_does():
 
 def test_an_untuned_member_keeps_its_q():
     loss = TsallisBCLoss([make_actor(0), make_actor(1)], q=[0.9, 0.9], gamma_mix=[1.0, 0.0])
-    tuner = QTuner(loss, tuned=[False, True])
-    for _ in range(50):
-        objective = tuner.step(torch.full((2, 16), 2.0))
+    tuner = QTuner(loss, tuned=[False, True], optimizer=lambda params: torch.optim.SGD(params, lr=0.01))
+    objective = tuner.step(torch.full((2, 16), 2.0))
     assert loss.q[0] == torch.tensor(0.9)
     assert loss.q[1] > 0.801
     assert objective[0] == 0

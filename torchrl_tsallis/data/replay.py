@@ -11,6 +11,22 @@ from tensordict.utils import NestedKey
 from torchrl.data import LazyMemmapStorage, SamplerWithoutReplacement, TensorDictReplayBuffer
 
 
+def check_rows(demonstrations: TensorDictBase, batch_size: int, keys: Sequence[NestedKey]) -> None:
+    """Raises for what cannot be trained on; see :func:`make_replay_buffer`."""
+    size = len(demonstrations)
+    if size < batch_size:
+        raise ValueError(f"{size} samples are fewer than a batch of {batch_size}: record more, or lower batch_size")
+    for key in keys:
+        value = demonstrations.get(key, None)
+        if value is None:
+            raise KeyError(f"the demonstrations have no {key!r}, only {sorted(map(str, demonstrations.keys(True)))}")
+        bad = (~value.isfinite().flatten(1).all(1)).nonzero()[:, 0].tolist()
+        if bad:
+            raise ValueError(
+                f"{key!r} is NaN or infinite in {len(bad)} of {size} rows, first {bad[:5]}: remove those rows"
+            )
+
+
 def make_replay_buffer(
     demonstrations: TensorDictBase,
     *,
@@ -43,20 +59,9 @@ def make_replay_buffer(
         >>> make_replay_buffer(data, batch_size=4).sample()["action"].shape
         torch.Size([4, 2])
     """
-    size = len(demonstrations)
-    if size < batch_size:
-        raise ValueError(f"{size} samples are fewer than a batch of {batch_size}: record more, or lower batch_size")
-    for key in keys:
-        value = demonstrations.get(key, None)
-        if value is None:
-            raise KeyError(f"the demonstrations have no {key!r}, only {sorted(map(str, demonstrations.keys(True)))}")
-        bad = (~value.isfinite().flatten(1).all(1)).nonzero()[:, 0].tolist()
-        if bad:
-            raise ValueError(
-                f"{key!r} is NaN or infinite in {len(bad)} of {size} rows, first {bad[:5]}: remove those rows"
-            )
+    check_rows(demonstrations, batch_size, keys)
     buffer = TensorDictReplayBuffer(
-        storage=LazyMemmapStorage(size, scratch_dir=scratch_dir),
+        storage=LazyMemmapStorage(len(demonstrations), scratch_dir=scratch_dir),
         sampler=SamplerWithoutReplacement(drop_last=True),
         batch_size=batch_size,
     )

@@ -10,11 +10,21 @@ from typing import Any
 import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.utils import NestedKey
-from torchrl.data import TensorDictReplayBuffer
+from torchrl.data import LazyMemmapStorage, TensorDictReplayBuffer
 from torchrl.data.replay_buffers.samplers import Sampler
 from torchrl.data.replay_buffers.storages import Storage
 
-from torchrl_tsallis.data.replay import make_replay_buffer
+from torchrl_tsallis.data.replay import check_rows
+
+
+class _RowStorage(LazyMemmapStorage):
+    """Reads ``[S, B]`` rows one by one in a row: general indexing takes several times as long."""
+
+    def get(self, index: Any) -> Any:
+        if not isinstance(index, torch.Tensor) or index.ndim != 2:
+            return super().get(index)
+        flat = index.flatten()
+        return self._storage.apply(lambda x: x.index_select(0, flat).unflatten(0, index.shape), batch_size=index.shape)
 
 
 class MemberSampler(Sampler):
@@ -137,8 +147,8 @@ def make_stacked_replay_buffer(
         >>> make_stacked_replay_buffer(data, seeds=[0, 1, 2], batch_size=4).sample()["action"].shape
         torch.Size([3, 4, 2])
     """
-    members: list[TensorDictBase]
-    members = [demonstrations] * len(seeds) if isinstance(demonstrations, TensorDictBase) else list(demonstrations)
+    shared = isinstance(demonstrations, TensorDictBase)
+    members: list[TensorDictBase] = [demonstrations] * len(seeds) if shared else list(demonstrations)
     unique = {id(member): member for member in members}
     rows, start = {}, 0
     for name, member in unique.items():
@@ -146,6 +156,8 @@ def make_stacked_replay_buffer(
         start += len(member)
     sampler = MemberSampler(seeds, [rows[id(member)] for member in members])
     together = torch.cat([member.select(*keys, strict=False) for member in unique.values()])
-    buffer = make_replay_buffer(together, batch_size=batch_size, keys=keys, scratch_dir=scratch_dir)
-    buffer.set_sampler(sampler)
+    check_rows(together, batch_size, keys)
+    storage = _RowStorage(len(together), scratch_dir=scratch_dir)
+    buffer = TensorDictReplayBuffer(storage=storage, sampler=sampler, batch_size=batch_size)
+    buffer.extend(together)
     return buffer

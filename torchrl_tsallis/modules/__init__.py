@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from torchrl_tsallis.modules.activations import Squish, squareplus, squish
+from torchrl_tsallis.modules.linear import Linear
+from torchrl_tsallis.modules.norm import RMSNorm
 from torchrl_tsallis.modules.policy import NormalHead, make_policy
 
-__all__ = ["NormalHead", "Squish", "make_policy", "squareplus", "squish"]
+__all__ = ["Linear", "NormalHead", "RMSNorm", "Squish", "make_policy", "squareplus", "squish"]

@@ -10,6 +10,8 @@ from torch import Tensor, nn
 from torchrl.modules import IndependentNormal, ProbabilisticActor
 
 from torchrl_tsallis.modules.activations import Squish, squareplus
+from torchrl_tsallis.modules.linear import Linear
+from torchrl_tsallis.modules.norm import RMSNorm
 
 
 class NormalHead(nn.Module):
@@ -24,6 +26,8 @@ class NormalHead(nn.Module):
         >>> loc.shape, scale[0]
         (torch.Size([5, 2]), tensor([1., 1.]))
     """
+
+    stackable = True
 
     def __init__(self, min_scale: float = 0.0) -> None:
         super().__init__()
@@ -70,8 +74,8 @@ def make_policy(
         raise ValueError(f"every dimension must be positive, got {obs_dim=}, {action_dim=}, {hidden=}")
     layers: list[nn.Module] = []
     for n_in, n_out in zip(sizes[:-1], sizes[1:], strict=True):
-        layers += [nn.Linear(n_in, n_out), nn.RMSNorm(n_out), Squish()]
-    network = nn.Sequential(*layers, nn.Linear(sizes[-1], 2 * action_dim), NormalHead())
+        layers += [Linear(n_in, n_out), RMSNorm(n_out), Squish()]
+    network = nn.Sequential(*layers, Linear(sizes[-1], 2 * action_dim), NormalHead())
     return ProbabilisticActor(
         TensorDictModule(network, in_keys=[observation_key], out_keys=["loc", "scale"]),
         in_keys=["loc", "scale"],

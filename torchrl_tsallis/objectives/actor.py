@@ -14,7 +14,7 @@ from tensordict.nn import (
     TensorDictModule,
 )
 from tensordict.utils import NestedKey
-from torch import Tensor
+from torch import Tensor, nn
 from torch.distributions import Distribution
 
 
@@ -75,6 +75,11 @@ def get_dist(actor: ProbabilisticTensorDictSequential, inputs: TensorDictBase) -
     return head.get_dist(_call(network, [inputs.get(key) for key in network.in_keys]))
 
 
+def _is_stackable(module: nn.Module) -> bool:
+    """Whether each module takes parameters with a leading member dimension."""
+    return all(isinstance(m, nn.Sequential) or getattr(m, "stackable", False) for m in module.modules())
+
+
 def get_stacked_dist(
     actor: ProbabilisticTensorDictSequential,
     inputs: TensorDictBase,
@@ -83,8 +88,9 @@ def get_stacked_dist(
 ) -> Distribution:
     """Distribution of S members at once, each with parameters and a batch of its own.
 
-    Only the networks are vectorized by ``torch.vmap``; the distribution is made of the stacked results, because its
-    checks of values cannot run under vmap.
+    Only the networks are vectorized, by ``torch.vmap``, or by themselves where all of their modules take stacked
+    parameters (see :class:`~torchrl_tsallis.modules.Linear`). The distribution is made of the stacked results, because
+    its checks of values cannot run under vmap.
 
     Args:
         actor: stochastic actor whose structure all members have.
@@ -101,6 +107,10 @@ def get_stacked_dist(
     parts = _network_and_head(actor)
     if actor.return_composite:
         raise NotImplementedError("stacked members need an actor with one distribution (return_composite=False)")
+
+    if parts is not None and _is_stackable(parts[0].module):
+        with params.to_module(actor, preserve_module_state=False):
+            return parts[1].get_dist(_call(parts[0], [inputs.get(key) for key in parts[0].in_keys]))
 
     def call(params: TensorDictBase, *given: Any) -> Any:
         with params.to_module(actor, preserve_module_state=False):

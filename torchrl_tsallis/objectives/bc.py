@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Literal
 
 import torch
 from tensordict import TensorDict, TensorDictBase, TensorDictParams, is_tensor_collection
@@ -17,6 +17,7 @@ from torchrl.objectives.common import LossModule
 
 from torchrl_tsallis.functional import bound_ratio, per_sample, rated_nll, rating
 from torchrl_tsallis.objectives.actor import get_dist, get_stacked_dist, log_prob_of
+from torchrl_tsallis.objectives.members import per_member
 from torchrl_tsallis.objectives.reference import MixtureReference, ReferenceDensity
 from torchrl_tsallis.objectives.statistics import masked_mean, rating_statistics
 
@@ -129,13 +130,13 @@ class TsallisBCLoss(LossModule):
         super().__init__()
         members = None if isinstance(actor_network, nn.Module) else list(actor_network)
         self.num_members = None if members is None else len(members)
-        q_values = self._per_member("q", q)
+        q_values = per_member("q", q, self.num_members)
         if not all(0 <= value <= 1 for value in q_values):
             raise ValueError(f"q must be in [0, 1] (1 is plain behavioral cloning), got {q}")
         if reduction not in (None, "mean", "sum", "none"):
             raise ValueError(f"reduction must be 'mean', 'sum' or 'none', got {reduction!r}")
         self._in_keys: list[NestedKey] | None = None
-        levels = self._per_member("gamma_mix", gamma_mix)
+        levels = per_member("gamma_mix", gamma_mix, self.num_members)
         self.reference = reference or MixtureReference(levels if members else levels[0], gamma_min, gamma_max)
         self.needs_target = self.reference.needs_target
         self.convert_to_functional(
@@ -153,16 +154,6 @@ class TsallisBCLoss(LossModule):
         if members and reference is None and self.needs_target and 0.0 in levels:
             self.target_members = torch.tensor([level != 0 for level in levels])
         self._last_batch: tuple[Tensor, Tensor | None] | None = None
-
-    def _per_member(self, name: str, value: Any) -> list[Any]:
-        """A setting of each member; of the one policy where there are none."""
-        count = self.num_members or 1
-        if isinstance(value, str) or not isinstance(value, (Sequence, Tensor)) or getattr(value, "ndim", 1) == 0:
-            return [value if isinstance(value, str) else float(value)] * count
-        values = value.tolist() if isinstance(value, Tensor) else list(value)
-        if self.num_members is None or len(values) != count:
-            raise ValueError(f"{name} has {len(values)} values for {count} policies: give a number or one of each")
-        return [x if isinstance(x, str) else float(x) for x in values]
 
     def _forward_value_estimator_keys(self, **kwargs: NestedKey) -> None:
         """Behavioral cloning has no value estimator to forward the keys to."""
@@ -263,7 +254,7 @@ class TsallisBCLoss(LossModule):
         return inputs
 
     def _dist_log_prob(
-        self, inputs: TensorDictBase, params: TensorDictParams
+        self, inputs: TensorDictBase, params: TensorDictBase
     ) -> tuple[torch.distributions.Distribution, Tensor]:
         if self.num_members is not None:
             dist = get_stacked_dist(self.actor_network, inputs, params, self.vmap_randomness)
@@ -271,6 +262,15 @@ class TsallisBCLoss(LossModule):
             with params.to_module(self.actor_network, preserve_module_state=False):
                 dist = get_dist(self.actor_network, inputs)
         return dist, log_prob_of(dist, inputs, self.tensor_keys.action)
+
+    def _target_log_prob(self, inputs: TensorDictBase) -> Tensor:
+        """The target network's log-density; 0 for members that are not rated by it, whose pass is saved."""
+        params = self.target_actor_network_params
+        if self.target_members is None:
+            return self._dist_log_prob(inputs, params)[1]
+        index = self.target_members.nonzero()[:, 0]
+        some = self._dist_log_prob(inputs[index], params.data[index])[1]
+        return some.new_zeros(inputs.shape).index_copy(0, index.to(some.device), some)
 
     def _mean(self, x: Tensor, mask: Tensor | None) -> Tensor:
         return masked_mean(x, mask, self.num_members is not None)
@@ -284,7 +284,7 @@ class TsallisBCLoss(LossModule):
             detached = log_prob.detach()
             target_log_prob = None
             if self.needs_target:
-                _, target_log_prob = self._dist_log_prob(inputs, self.target_actor_network_params)
+                target_log_prob = self._target_log_prob(inputs)
             moment = self._mean(rating(detached, 0.0, per_sample(self.q, detached)), mask)
             reference = self.reference(dist, target_log_prob, moment)
         return log_prob, reference.log_density, reference.gamma_mix, moment, mask

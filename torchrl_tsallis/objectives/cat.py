@@ -97,7 +97,6 @@ class CATSoftUpdate(TargetNetUpdater):
             return
         super().init_()
         sources = {f"target_{name}": source for name, source in self._sources.items()}
-        self._pulled = getattr(self.loss_module, "target_members", None)
         self._cat = {name: _Group(self, sources[name], target) for name, target in self._targets.items()}
 
     @torch.no_grad()
@@ -138,6 +137,7 @@ class _Group:
             "nu": flat.new_full((count,), updater.k + eps),
             "started": flat.new_full((count,), 0.0 if first else 1.0),
         }
+        self.alone: Tensor | None = None
         self.buffers: list[tuple[Tensor, list[Tensor]]] = []  # of a step
 
     def __getstate__(self) -> dict[str, Any]:
@@ -153,18 +153,21 @@ class _Group:
         started.masked_fill_(fresh, 1.0)
         self.waiting = not bool(started.all())
 
-    def _prepare(self) -> None:
+    def _prepare(self, loss_module: LossModule) -> None:
         """Makes the buffers, and moves the state to the parameters' data type and device."""
         like = self.target[0]
         self.state = {name: x.to(like) for name, x in self.state.items()}
         self.segments = Segments(self.target, self.segments.batch_dims)
         self.buffers = [self.segments.buffer(like) for _ in range(2)]
+        pulled = getattr(loss_module, "target_members", None)
+        if pulled is not None and self.segments.batch_dims == 1:
+            self.alone = self.segments.expand(~pulled.to(like.device).repeat(len(self.target)))
 
     def step(self, updater: CATSoftUpdate) -> None:
         """One update, in place of the source and the target."""
         source, target, scale = self.source, self.target, self.state["scale"]
         if not self.buffers or scale.dtype != target[0].dtype or scale.device != target[0].device:
-            self._prepare()
+            self._prepare(updater.loss_module)
         seg, eps, tau = self.segments, updater.eps, updater.tau
         (d, d_views), (followed, followed_views) = self.buffers
         torch._foreach_copy_(d_views, source)
@@ -183,9 +186,8 @@ class _Group:
         torch._foreach_add_(target, followed_views)
         if updater.strength:  # strength (tau - t) d, by what was not followed
             d.mul_(tau).sub_(followed)
-            if updater._pulled is not None and seg.batch_dims == 1:
-                for view in d_views:  # a member that is not rated by its target is left alone
-                    view[~updater._pulled.to(view.device)] = 0.0
+            if self.alone is not None:
+                d.masked_fill_(self.alone, 0.0)  # a member that is not rated by its target is left alone
             torch._foreach_sub_(source, d_views, alpha=updater.strength)
 
     def views(self, name: str) -> dict[str, Tensor]:
