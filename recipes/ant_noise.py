@@ -79,7 +79,7 @@ def unit_logger(unit: Unit, cfg: DictConfig) -> LoggerGroup:
     """The loggers of a training; opened again, they continue its run."""
     task, _, method = unit
     folder = folder_of(unit, cfg)
-    return make_logger(cfg.logger, folder.parent, method, group=f"{task}/{method}", tags=[task, method])
+    return make_logger(cfg.log, folder.parent, method, group=f"{task}/{method}", tags=[task, method])
 
 
 def check_settings(units: list[Unit], cfg: DictConfig) -> None:
@@ -179,7 +179,7 @@ def main(cfg: DictConfig) -> None:
         raise SystemExit("interrupted: the same command with resume=true goes on from the last checkpoint") from None
     rows = [row for folder in folders.values() for row in read_returns(folder / "returns.csv")]
     save_returns(cfg.results, rows)
-    text = report(rows, Path(cfg.output), Path(cfg.pictures), cfg.logger)
+    text = report(rows, Path(cfg.output), Path(cfg.pictures), cfg.log)
     minutes = (time.monotonic() - start) / 60
     print(f"\n{text}\n{minutes:.1f} minutes; returns in {cfg.results}, pictures in {cfg.pictures}")
 

@@ -49,7 +49,7 @@ def gone(group: int) -> bool:
 @pytest.fixture(scope="module")
 def unbroken(tmp_path_factory):
     folder = tmp_path_factory.mktemp("unbroken")
-    return folder, *finish(start(folder))
+    return folder, *finish(start(folder, "log=tensorboard"))
 
 
 def test_one_command_gives_table_returns_pictures_and_a_video(unbroken):
@@ -66,6 +66,7 @@ def test_one_command_gives_table_returns_pictures_and_a_video(unbroken):
         unit = output / "both" / "seed_0" / method
         assert (unit / "rollout.gif").stat().st_size > 1000
         assert len((unit / "scalars" / "loss_tsallis_bc.csv").read_text().split()) == 80
+    assert list(output.rglob("events.out.tfevents*"))
     assert "recording: 100%" in err and "training: 100%" in err and "evaluate: 100%" in err
 
 
@@ -74,7 +75,7 @@ def test_an_interrupted_job_goes_on_to_the_same_weights(unbroken, tmp_path, sign
     (tmp_path / "outputs").mkdir()
     (tmp_path / "outputs" / "ant_data").symlink_to(unbroken[0] / "outputs" / "ant_data")
     unit = tmp_path / "outputs" / "ant_noise" / "both" / "seed_0" / "proposal"
-    process = start(tmp_path, "method=proposal")
+    process = start(tmp_path, "method=proposal", "log=wandb")
     deadline = time.monotonic() + 300
     while not list(unit.glob("checkpoints/*")) and process.poll() is None and time.monotonic() < deadline:
         time.sleep(0.05)
@@ -86,7 +87,8 @@ def test_an_interrupted_job_goes_on_to_the_same_weights(unbroken, tmp_path, sign
     assert process.returncode == -sign if sign == signal.SIGKILL else "resume=true" in err, err
     assert list(unit.glob("checkpoints/*")) and not (unit / "policy.safetensors").exists()
     assert gone(process.pid), "a worker is left"
-    finish(start(tmp_path, "method=proposal", "resume=true"))
+    finish(start(tmp_path, "method=proposal", "log=wandb", "resume=true"))
+    assert len({path.name.split("-")[-1] for path in unit.rglob("offline-run-*")}) == 1  # one W&B run, continued
     ours, whole = (
         load_file(folder / "outputs/ant_noise/both/seed_0/proposal/policy.safetensors")
         for folder in (tmp_path, unbroken[0])

@@ -180,6 +180,8 @@ def _wandb(root: Path, name: str, settings: dict[str, Any]) -> Logger:
         settings["mode"] = "offline" if (reason := _why_offline()) else "online"
         if reason and reason != "no account":
             warnings.warn(f"W&B is not reachable ({reason}): logging off-line; use `wandb sync` later", stacklevel=3)
+        if reason:
+            os.environ.setdefault("WANDB_SILENT", "true")  # it would print a page a run; online it shows the address
     try:
         return WandbLogger(name, id=_wandb_id(file), **settings)
     except Exception as error:  # wandb raises many kinds for a server that answers, but not as it should
