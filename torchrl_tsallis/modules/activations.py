@@ -35,7 +35,7 @@ class _Squish(torch.autograd.Function):
 
     @staticmethod
     def forward(x: Tensor) -> tuple[Tensor, Tensor]:
-        s = x.square().add_(4).rsqrt_().mul_(x)
+        s = torch.addcmul(x.new_full((), 4.0), x, x).rsqrt_().mul_(x)
         return torch.addcmul(x, x, s).mul_(0.5), s
 
     @staticmethod
@@ -49,7 +49,7 @@ class _Squish(torch.autograd.Function):
         if torch.is_grad_enabled():  # for a second derivative s is a function of x
             s = x * (x.square() + 4).rsqrt()
             return grad * (0.5 + s * (1 - 0.5 * s.square()))
-        return s.square().mul_(-0.5).add_(1).mul_(s).add_(0.5).mul_(grad)
+        return torch.addcmul(s, s, s.square(), value=-0.5).add_(0.5).mul_(grad)
 
     @staticmethod
     def vmap(info: Any, in_dims: tuple[int | None], x: Tensor) -> tuple[Any, tuple[int | None, int | None]]:

@@ -33,8 +33,8 @@ class _RMSNorm(torch.autograd.Function):
             unit = x * inverse
         product = grad * unit
         by_weight = product.sum_to_size(weight.shape)
-        common = (product * weight).mean(-1, keepdim=True) if second else product.mul_(weight).mean(-1, keepdim=True)
         by_unit = grad * weight
+        common = (product * weight if second else product.mul_(weight)).mean(-1, keepdim=True)
         if second:
             return (by_unit - unit * common) * inverse, by_weight, None
         return by_unit.addcmul_(unit, common, value=-1).mul_(inverse), by_weight, None

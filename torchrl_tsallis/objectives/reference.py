@@ -96,6 +96,7 @@ class MixtureReference(ReferenceDensity):
         for level in levels:
             if level != "adaptive" and (isinstance(level, str) or not 0 <= level <= 1):
                 raise ValueError(f"gamma_mix must be 'adaptive' or a number in [0, 1], got {level!r}")
+        self.gamma_mix = gamma_mix
         self.levels = levels
         self.members = many
         self.gamma_min = gamma_min
