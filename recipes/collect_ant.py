@@ -37,7 +37,7 @@ def record(job: tuple[str, int, int], std: float, length: int, clip: bool) -> tu
 def collect_dataset(
     output: str | Path,
     *,
-    std: float = 0.25,
+    std: float = 0.2,
     seed: int = 0,
     length: int = 999,
     clip: bool = False,
