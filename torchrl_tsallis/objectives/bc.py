@@ -32,7 +32,7 @@ class _Rated(NamedTuple):
     gamma: Tensor
     moment: Tensor  # E[pi^(1-q)]
     mean_log_prob: Tensor
-    count: Tensor | None  # valid samples in all processes; None where there is only one
+    num_valid: Tensor | None  # samples in all processes; None where there is only one
     mask: Tensor | None
 
 
@@ -327,8 +327,8 @@ class TsallisBCLoss(LossModule):
         Of several processes, the mean is this process's share of it times their number.
         """
         members, mask = self.num_members is not None, rated.mask
-        if self.reduction == "mean" and rated.count is not None:
-            scale = num_processes(self.process_group) / rated.count.clamp_min(1)
+        if self.reduction == "mean" and rated.num_valid is not None:
+            scale = num_processes(self.process_group) / rated.num_valid.clamp_min(1)
             return masked_sum(losses, mask, members) * scale.to(losses)
         if not members or self.reduction == "none":
             return self._reduce_loss(losses, tensordict)
