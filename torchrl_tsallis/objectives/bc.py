@@ -36,6 +36,11 @@ class _Rated(NamedTuple):
     mask: Tensor | None
 
 
+def _as_leaf(x: Tensor) -> Tensor:
+    """A copy that an optimizer takes, if there is a gradient to take."""
+    return nn.Parameter(x.detach().clone()) if x.requires_grad else x.clone()
+
+
 class TsallisBCLoss(LossModule):
     r"""Noise-robust behavioral cloning by adaptive absolute-relative ratings (eq. 10).
 
@@ -170,6 +175,8 @@ class TsallisBCLoss(LossModule):
             expand_dim=self.num_members,
             create_target_params=self.needs_target,
         )
+        if self.num_members == 1:  # TorchRL has expanded the parameters of a single module: they are leaves no more
+            self.actor_network_params = TensorDictParams(self.actor_network_params.apply(_as_leaf), no_convert=True)
         self.register_buffer("q", torch.tensor(q_values if members else q_values[0]))
         self.reduction = reduction or "mean"
         self.sync_stats = sync_stats
