@@ -46,6 +46,13 @@ def demonstrations(cfg: DictConfig, progress: bool = False) -> tuple[Any, Any]:
     )
 
 
+def differ(before: Any, wanted: Any) -> bool:
+    """Whether settings differ; an option that one of the two versions of the package does not have does not count."""
+    if isinstance(before, dict) and isinstance(wanted, dict):
+        return any(differ(before[name], wanted[name]) for name in before.keys() & wanted.keys())
+    return before != wanted
+
+
 def keep_settings(file: Path, settings: Mapping[str, Any], names: Sequence[str], way_out: str = "") -> None:
     """Writes settings to a file, which must not hold other ones already.
 
@@ -60,7 +67,7 @@ def keep_settings(file: Path, settings: Mapping[str, Any], names: Sequence[str],
     """
     wanted = json.loads(json.dumps({name: settings[name] for name in names}))
     before = json.loads(file.read_text()) if file.exists() else wanted
-    changed = [name for name in wanted if before.get(name) != wanted[name]]
+    changed = [name for name in wanted if differ(before.get(name), wanted[name])]
     if changed:
         advice = f"choose another output{', or ' * bool(way_out)}{way_out}"
         raise SystemExit(f"{file} was made with other {', '.join(changed)}: {advice}")

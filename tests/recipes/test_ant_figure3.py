@@ -178,6 +178,19 @@ def units(monkeypatch):
     return ant_units
 
 
+def test_settings_that_changed_are_refused_and_new_options_are_not(units, tmp_path):
+    from ant_common import keep_settings
+
+    file = tmp_path / "settings.json"
+    settings = {"loss": {"gamma_min": 0.1, "levels": [1, 2]}, "epochs": 3, "workers": 1}
+    keep_settings(file, settings, ["loss", "epochs"])
+    keep_settings(file, settings | {"workers": 2}, ["loss", "epochs"])
+    keep_settings(file, settings | {"loss": settings["loss"] | {"sync_stats": True}}, ["loss", "epochs"])
+    for changed in ({"loss": settings["loss"] | {"gamma_min": 0.2}}, {"loss": {"levels": [1]}}):
+        with pytest.raises(SystemExit, match="made with other loss: choose another output, or stop"):
+            keep_settings(file, settings | changed, ["loss", "epochs"], "stop")
+
+
 def row_of(key, episode: int) -> dict:
     return dict(zip(("method", "task", "std", "seed"), key, strict=True)) | {"episode": episode, "return": 1.0}
 
