@@ -12,44 +12,34 @@ Methods, tasks and seeds are overrides, one or a list; ``resume=true`` continues
 
 from __future__ import annotations
 
-import json
 import shutil
 import time
 from functools import partial
 from itertools import product
 from pathlib import Path
-from typing import Any
 
 import hydra
 import torch
+from ant_common import TRAINING, as_list, check_names, demonstrations, keep_settings
 from ant_report import kinds_of, read_returns, report, save_returns
-from collect_ant import collect_dataset
 from hydra.utils import instantiate
-from omegaconf import DictConfig, ListConfig, OmegaConf
+from omegaconf import DictConfig, OmegaConf
 from safetensors.torch import load_file, save_file
 from torchrl._utils import logger as torchrl_logger
 
 import torchrl_tsallis.trainers.configs  # noqa: F401 (registers the groups that the YAML file names)
 from torchrl_tsallis._io import atomic_path
 from torchrl_tsallis._pool import run_jobs, tick
-from torchrl_tsallis.data import TASKS, make_replay_buffer, make_task, validate_demonstrations
+from torchrl_tsallis.data import make_replay_buffer, make_task, validate_demonstrations
 from torchrl_tsallis.evaluation import MeanPolicy, evaluate_policies, median, record_rollout
 from torchrl_tsallis.trainers import LoggerGroup, make_logger, resume
 
 Unit = tuple[str, int, str]  # task, seed, method: one training
 
 
-def as_list(value: Any) -> list[Any]:
-    """One value or a list of them, as a list."""
-    return list(value) if isinstance(value, (list, ListConfig)) else [value]
-
-
 def units_of(cfg: DictConfig) -> list[Unit]:
     """The trainings that are asked for."""
-    for name, allowed in (("task", TASKS), ("method", cfg.methods)):
-        unknown = [value for value in as_list(cfg[name]) if value not in allowed]
-        if unknown:
-            raise SystemExit(f"no {name} {unknown[0]!r}: choose one or a list of {', '.join(allowed)}")
+    check_names(cfg)
     return list(product(as_list(cfg.task), as_list(cfg.seed), as_list(cfg.method)))
 
 
@@ -57,22 +47,6 @@ def folder_of(unit: Unit, cfg: DictConfig) -> Path:
     """Where a training's files are."""
     task, seed, method = unit
     return Path(cfg.output) / task / f"seed_{seed}" / method
-
-
-def demonstrations(cfg: DictConfig, progress: bool = False) -> tuple[Any, Any]:
-    """The recorded demonstrations, from the cache or made now."""
-    data = cfg.data
-    return collect_dataset(
-        data.cache,
-        std=data.std,
-        seed=data.seed,
-        length=data.length,
-        clip=data.clip,
-        experts=tuple(data.policies[:-1]),
-        amateur=data.policies[-1],
-        workers=cfg.workers,
-        progress=progress,
-    )
 
 
 def unit_logger(unit: Unit, cfg: DictConfig) -> LoggerGroup:
@@ -84,17 +58,11 @@ def unit_logger(unit: Unit, cfg: DictConfig) -> LoggerGroup:
 
 def check_settings(units: list[Unit], cfg: DictConfig) -> None:
     """Keeps each training's settings in its folder; a resumed one must have the same."""
-    names = ("policy", "loss", "tuner", "optimizer", "updater", "epochs", "batch_size", "data", "evaluation")
     every = OmegaConf.to_container(cfg, resolve=True)
     for unit in units:
-        file = folder_of(unit, cfg) / "settings.json"
-        wanted = json.loads(json.dumps({name: every[name] for name in names} | every["methods"][unit[2]]))
-        before = json.loads(file.read_text()) if file.exists() else wanted
-        changed = [name for name in wanted if before.get(name) != wanted[name]]
-        if changed:
-            raise SystemExit(f"{file} was made with other {', '.join(changed)}: choose another output, or resume=false")
-        with atomic_path(file) as path:
-            path.write_text(json.dumps(wanted, indent=1))
+        method = every["methods"][unit[2]]
+        names = (*TRAINING, "evaluation", *method)
+        keep_settings(folder_of(unit, cfg) / "settings.json", every | method, names, "resume=false")
 
 
 def train(unit: Unit, cfg: DictConfig) -> None:

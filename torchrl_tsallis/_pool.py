@@ -53,6 +53,17 @@ def _start(queue: Any) -> None:
     prepare_worker()
 
 
+class _Bar:
+    """Stands where :func:`tick` expects the queue of a worker process."""
+
+    def __init__(self, bar: Any) -> None:
+        self.bar = bar
+
+    def put(self, count: int) -> None:
+        """Advances the bar."""
+        self.bar.update(count)
+
+
 def run_jobs(
     function: Callable[[Job], Result],
     jobs: Sequence[Job],
@@ -68,7 +79,7 @@ def run_jobs(
     Args:
         function: picklable; calls :func:`tick` as it proceeds.
         jobs: its arguments, picklable.
-        workers: number of processes.
+        workers: number of processes; 0 runs the jobs in this one.
         total: number of ticks of all jobs.
         desc: text before the progress bar.
         unit: what a tick is.
@@ -83,6 +94,14 @@ def run_jobs(
     """
     from tqdm import tqdm
 
+    if workers == 0:
+        global _QUEUE
+        with tqdm(total=total, desc=desc, unit=unit, disable=not progress) as bar:
+            _QUEUE = _Bar(bar)
+            try:
+                return [function(job) for job in jobs]
+            finally:
+                _QUEUE = None
     context = multiprocessing.get_context("spawn")
     queue = context.Queue()
     pool = ProcessPoolExecutor(workers, context, _start, (queue,))

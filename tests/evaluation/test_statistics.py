@@ -3,7 +3,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from torchrl_tsallis.evaluation.statistics import auroc, bootstrap_interval, iqm, median, probability_of_improvement
+from torchrl_tsallis.evaluation.statistics import (
+    auroc,
+    bootstrap_interval,
+    improvement_interval,
+    iqm,
+    median,
+    probability_of_improvement,
+)
 
 
 def test_median_by_hand():
@@ -75,3 +82,24 @@ def test_empty_and_nan(function):
 def test_ragged():
     with pytest.raises(ValueError, match="rectangular"):
         median([[1.0], [1.0, 2.0]])
+
+
+def test_improvement_and_its_interval():
+    rng = np.random.default_rng(0)
+    x, y = rng.integers(0, 6, 9).astype(float), rng.integers(0, 5, 7).astype(float)
+    result = improvement_interval(x, y)
+    assert result["value"] == pytest.approx(probability_of_improvement(x, y))
+    assert 0 <= result["low"] < result["value"] < result["high"] <= 1
+    assert result == improvement_interval(x, y, seed=0) != improvement_interval(x, y, seed=1)
+    # Two seeds against one: a draw has both, or one of them twice.
+    result = improvement_interval([0.0, 2.0], [1.0])
+    assert result == {"value": 0.5, "low": 0.0, "high": 1.0}
+
+
+def test_improvement_is_stratified_by_task_and_averages_them():
+    x, y = [[1.0, 1.0], [0.0, 0.0]], [[0.0, 0.0, 0.0], [5.0, 5.0, 5.0]]  # better on one task, worse on the other
+    assert improvement_interval(x, y) == {"value": 0.5, "low": 0.5, "high": 0.5}
+    with pytest.raises(ValueError, match="as many tasks"):
+        improvement_interval(x, y[0])
+    with pytest.raises(ValueError, match="resamples=0"):
+        improvement_interval(x, y, resamples=0)

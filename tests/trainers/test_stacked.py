@@ -93,6 +93,19 @@ def test_members_of_all_methods_equal_their_solo_runs():
     assert all(torch.equal(a.state_dict()[n], v) for a, i in zip(actors, initial, strict=True) for n, v in i.items())
 
 
+def test_a_list_of_one_policy_equals_the_policy_by_itself():
+    data = data_of(0)
+    loss, step = stacked_step(["proposal"], [make_actor(0)])
+    actor = make_actor(0).double()
+    solo_loss, solo_step_ = solo_step("proposal", actor)
+    assert len(list(loss.parameters())) == len(list(solo_loss.parameters())) > 0
+    for k in range(4):
+        step(data[None, 16 * k : 16 * k + 16])
+        solo_step_(data[16 * k : 16 * k + 16])
+    for name, value in loss.member_state_dict(0).items():
+        torch.testing.assert_close(value, actor.state_dict()[name], rtol=1e-4, atol=1e-8)
+
+
 def make_trainer(methods: list[str], seeds: list[int], folder=None, steps: int = 24, bad: int | None = None, **kwargs):
     """A stacked run, or with one method and seed a single one, through the offline trainer."""
     data = [data_of(seed) for seed in seeds]

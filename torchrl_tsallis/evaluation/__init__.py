@@ -3,10 +3,18 @@
 from __future__ import annotations
 
 from torchrl_tsallis.evaluation.flip_plots import force_over_time
+from torchrl_tsallis.evaluation.grid_plots import returns_grid
 from torchrl_tsallis.evaluation.mean_policy import MeanPolicy
 from torchrl_tsallis.evaluation.plots import auroc_bars, rating_histogram, return_by_method, schedule
 from torchrl_tsallis.evaluation.rollouts import evaluate_policies
-from torchrl_tsallis.evaluation.statistics import auroc, bootstrap_interval, iqm, median, probability_of_improvement
+from torchrl_tsallis.evaluation.statistics import (
+    auroc,
+    bootstrap_interval,
+    improvement_interval,
+    iqm,
+    median,
+    probability_of_improvement,
+)
 from torchrl_tsallis.evaluation.video import record_rollout
 
 __all__ = [
@@ -16,11 +24,13 @@ __all__ = [
     "bootstrap_interval",
     "evaluate_policies",
     "force_over_time",
+    "improvement_interval",
     "iqm",
     "median",
     "probability_of_improvement",
     "rating_histogram",
     "record_rollout",
     "return_by_method",
+    "returns_grid",
     "schedule",
 ]

@@ -145,3 +145,43 @@ def probability_of_improvement(x: ArrayLike, y: ArrayLike) -> float:
     if a.ndim != 1 or b.ndim != 1:
         raise ValueError(f"need one score a seed, got shapes {a.shape} and {b.shape}: reduce over episodes first")
     return auroc(a, b)
+
+
+def improvement_interval(
+    x: ArrayLike, y: ArrayLike, *, confidence: float = 0.95, resamples: int = 2000, seed: int = 0
+) -> dict[str, float]:
+    """Probability of improvement with a percentile bootstrap interval over seeds, stratified by task.
+
+    The seeds of both are drawn with replacement inside each task; over several tasks it is the mean of theirs.
+
+    Args:
+        x: one score a seed, ``[S]``, or ``[T, S]`` for several tasks.
+        y: one score a seed, ``[S']`` or ``[T, S']``.
+        confidence: coverage (0.95).
+        resamples: bootstrap draws (2000).
+        seed: of the generator (0).
+
+    Returns:
+        ``{"value", "low", "high"}``.
+
+    Raises:
+        ValueError: if an input is empty or has NaN, or the numbers of tasks differ.
+
+    Examples:
+        >>> improvement_interval([2.0, 3.0], [1.0, 1.5])
+        {'value': 1.0, 'low': 1.0, 'high': 1.0}
+    """
+    a, b = np.atleast_2d(_checked(x, "x")), np.atleast_2d(_checked(y, "y"))
+    if a.ndim != 2 or b.ndim != 2 or len(a) != len(b) or not 0 < confidence < 1 or resamples < 1:
+        raise ValueError(
+            f"need [S] or [T, S] of as many tasks, got {a.shape} and {b.shape}; {confidence=}, {resamples=}"
+        )
+    wins = (a[:, :, None] > b[:, None]) + 0.5 * (a[:, :, None] == b[:, None])  # [T, S, S']
+    rng = np.random.default_rng(seed)
+    tasks = np.arange(len(a))[:, None, None]
+    draws = []
+    for _ in range(resamples):
+        i, j = (rng.integers(n, size=(len(a), n)) for n in wins.shape[1:])
+        draws.append(wins[tasks, i[:, :, None], j[:, None]].mean())
+    low, high = np.quantile(draws, [(1 - confidence) / 2, (1 + confidence) / 2])
+    return {"value": float(wins.mean()), "low": float(low), "high": float(high)}

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
+from functools import partial
+from typing import Any, Literal, NamedTuple
 
 import torch
 from tensordict import TensorDict, TensorDictBase, TensorDictParams, is_tensor_collection
@@ -17,9 +18,27 @@ from torchrl.objectives.common import LossModule
 
 from torchrl_tsallis.functional import bound_ratio, per_sample, rated_nll, rating
 from torchrl_tsallis.objectives.actor import get_dist, get_stacked_dist, log_prob_of
+from torchrl_tsallis.objectives.distributed import GlobalSum, global_sum, num_processes
 from torchrl_tsallis.objectives.members import per_member
 from torchrl_tsallis.objectives.reference import MixtureReference, ReferenceDensity
-from torchrl_tsallis.objectives.statistics import masked_mean, rating_statistics
+from torchrl_tsallis.objectives.statistics import global_means, masked_mean, masked_sum, rating_statistics
+
+
+class _Rated(NamedTuple):
+    """What the loss knows of a batch: ``[*B]``, and statistics, scalars or ``[S]``."""
+
+    log_prob: Tensor  # with gradient
+    log_reference: Tensor
+    gamma: Tensor
+    moment: Tensor  # E[pi^(1-q)]
+    mean_log_prob: Tensor
+    num_valid: Tensor | None  # samples in all processes; None where there is only one
+    mask: Tensor | None
+
+
+def _as_leaf(x: Tensor) -> Tensor:
+    """A copy that an optimizer takes, if there is a gradient to take."""
+    return nn.Parameter(x.detach().clone()) if x.requires_grad else x.clone()
 
 
 class TsallisBCLoss(LossModule):
@@ -60,6 +79,12 @@ class TsallisBCLoss(LossModule):
     the members' means, so that each has the gradient that it would have alone; every other output is ``[S]``. The
     optimizer has to keep members apart, as ``AdaTerm(loss.parameters(), batch_dims=1)`` does.
 
+    **Data-parallel training.** Where ``torch.distributed`` is initialised, every statistic of the batch (gamma's
+    moment, the bound, what is logged of the rating) is that of all processes' samples, and so is the q tuner's. With
+    ``reduction="mean"`` the loss is scaled so that the average of the processes' gradients, as
+    ``DistributedDataParallel`` takes it, is the gradient of the mean over all samples, also where their numbers differ
+    by a mask. Every process has to call ``forward`` then; :meth:`rating` does not communicate.
+
     The target network exists only if the reference needs it. With a target network, a target updater such as
     :class:`~torchrl_tsallis.CATSoftUpdate` has to follow the policy.
 
@@ -80,6 +105,9 @@ class TsallisBCLoss(LossModule):
         reference (ReferenceDensity): another reference density than the paper's mixture; ``gamma_mix`` and its bounds
             are not used then. Default: None.
         reduction (str): ``"mean"``, ``"sum"`` or ``"none"``. Default: ``"mean"``.
+        sync_stats (bool): take the statistics of the batch over all processes of ``torch.distributed``, where it is
+            initialised. Default: True.
+        process_group (ProcessGroup): these processes only. Default: None, all of them.
 
     Raises:
         ValueError: for a setting outside of its range, and in ``forward`` for shapes that do not fit.
@@ -126,6 +154,8 @@ class TsallisBCLoss(LossModule):
         gamma_max: float = 0.9,
         reference: ReferenceDensity | None = None,
         reduction: Literal["mean", "sum", "none"] | None = None,
+        sync_stats: bool = True,
+        process_group: Any = None,
     ) -> None:
         super().__init__()
         members = None if isinstance(actor_network, nn.Module) else list(actor_network)
@@ -145,8 +175,12 @@ class TsallisBCLoss(LossModule):
             expand_dim=self.num_members,
             create_target_params=self.needs_target,
         )
+        if self.num_members == 1:  # TorchRL has expanded the parameters of a single module: they are leaves no more
+            self.actor_network_params = TensorDictParams(self.actor_network_params.apply(_as_leaf), no_convert=True)
         self.register_buffer("q", torch.tensor(q_values if members else q_values[0]))
         self.reduction = reduction or "mean"
+        self.sync_stats = sync_stats
+        self.process_group = process_group
         if members and self.reduction != "none":
             self.out_keys = [*self.out_keys, "member_loss"]
         #: Which stacked members are rated by their target network, ``[S]`` bool; None for all of them.
@@ -272,11 +306,15 @@ class TsallisBCLoss(LossModule):
         some = self._dist_log_prob(inputs[index], params.data[index])[1]
         return some.new_zeros(inputs.shape).index_copy(0, index.to(some.device), some)
 
-    def _mean(self, x: Tensor, mask: Tensor | None) -> Tensor:
-        return masked_mean(x, mask, self.num_members is not None)
+    @property
+    def global_sum(self) -> GlobalSum | None:
+        """Sums over the processes of data-parallel training; None where there is one, or without ``sync_stats``."""
+        if not self.sync_stats or num_processes(self.process_group) == 1:
+            return None
+        return partial(global_sum, group=self.process_group)
 
-    def _rate(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor | None]:
-        """Log-density (with gradient), log reference, gamma, E[pi^(1-q)] and the mask."""
+    def _rate(self, tensordict: TensorDictBase, total: GlobalSum | None = None) -> _Rated:
+        """Rates a batch, with its statistics over the processes that ``total`` sums over."""
         mask = self._mask(tensordict)
         inputs = self._inputs(tensordict, mask)
         dist, log_prob = self._dist_log_prob(inputs, self.actor_network_params)
@@ -285,9 +323,23 @@ class TsallisBCLoss(LossModule):
             target_log_prob = None
             if self.needs_target:
                 target_log_prob = self._target_log_prob(inputs)
-            moment = self._mean(rating(detached, 0.0, per_sample(self.q, detached)), mask)
+            density = rating(detached, 0.0, per_sample(self.q, detached))
+            (moment, mean), count = global_means([density, detached], mask, self.num_members is not None, total)
             reference = self.reference(dist, target_log_prob, moment)
-        return log_prob, reference.log_density, reference.gamma_mix, moment, mask
+        return _Rated(log_prob, reference.log_density, reference.gamma_mix, moment, mean, count, mask)
+
+    def _reduce(self, losses: Tensor, rated: _Rated, tensordict: TensorDictBase) -> Tensor:
+        """The losses as they are, or their mean or sum, ``[S]`` with members.
+
+        Of several processes, the mean is this process's share of it times their number.
+        """
+        members, mask = self.num_members is not None, rated.mask
+        if self.reduction == "mean" and rated.num_valid is not None:
+            scale = num_processes(self.process_group) / rated.num_valid.clamp_min(1)
+            return masked_sum(losses, mask, members) * scale.to(losses)
+        if not members or self.reduction == "none":
+            return self._reduce_loss(losses, tensordict)
+        return (masked_mean if self.reduction == "mean" else masked_sum)(losses, mask, True)
 
     def rating(self, tensordict: TensorDictBase) -> Tensor:
         """Rating of every sample (eq. 11): near 0 for what the imitator holds for noise.
@@ -300,8 +352,8 @@ class TsallisBCLoss(LossModule):
             The rating, ``[*B]``.
         """
         with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC), set_recurrent_mode(True):
-            log_prob, log_reference, *_ = self._rate(tensordict)
-            return rating(log_prob, log_reference, per_sample(self.q, log_prob))
+            rated = self._rate(tensordict)
+            return rating(rated.log_prob, rated.log_reference, per_sample(self.q, rated.log_prob))
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -313,25 +365,23 @@ class TsallisBCLoss(LossModule):
         Returns:
             A tensordict with the keys of ``out_keys``.
         """
-        log_prob, log_reference, gamma, moment, mask = self._rate(tensordict)
-        losses, weights = rated_nll(log_prob, log_reference, per_sample(self.q, log_prob))
-        if self.num_members is None or self.reduction == "none":
-            out = {"loss_tsallis_bc": self._reduce_loss(losses, tensordict)}
-        else:  # the sum over members: each gets the gradient that it would have by itself
-            if self.reduction == "mean":
-                of_member = self._mean(losses, mask)
-            else:
-                of_member = (losses if mask is None else losses.where(mask, 0.0)).flatten(1).sum(1)
+        total, members = self.global_sum, self.num_members is not None
+        rated = self._rate(tensordict, total)
+        losses, weights = rated_nll(rated.log_prob, rated.log_reference, per_sample(self.q, rated.log_prob))
+        out = {"loss_tsallis_bc": self._reduce(losses, rated, tensordict)}
+        if members and self.reduction != "none":
+            # The sum over members: each gets the gradient that it would have by itself.
+            of_member = out["loss_tsallis_bc"]
             out = {"loss_tsallis_bc": of_member.sum(), "member_loss": of_member.detach()}
         with torch.no_grad():
-            detached = log_prob.detach()
+            detached = rated.log_prob.detach()
             if not torch._C._functorch.is_batchedtensor(detached):  # would leak out of torch.vmap
-                self._last_batch = (detached, mask)
+                self._last_batch = (detached, rated.mask)
             out["q"] = self.q.clone()
-            out["gamma_mix"] = gamma
-            out |= rating_statistics(weights, mask, self.num_members is not None)
-            out["log_prob"] = self._mean(detached, mask)
-            out["bound"] = bound_ratio(moment, gamma=gamma)
+            out["gamma_mix"] = rated.gamma
+            out |= rating_statistics(weights, rated.mask, members, total)
+            out["log_prob"] = rated.mean_log_prob
+            out["bound"] = bound_ratio(rated.moment, gamma=rated.gamma)
         td_out = TensorDict(out, [])
         self._clear_weakrefs(tensordict, td_out, "actor_network_params", "target_actor_network_params")
         return td_out

@@ -74,6 +74,8 @@ class TsallisBCLossConfig(LossConfig):
     gamma_max: float = 0.9
     reference: Any = None
     reduction: str | None = None
+    sync_stats: bool = True
+    process_group: Any = None
     _target_: str = "torchrl_tsallis.trainers.configs.make_loss"
 
 

@@ -11,6 +11,7 @@ from torchrl.trainers import Trainer, TrainerHookBase
 
 from torchrl_tsallis.functional import MAX_EXPONENT, bound_ratio, density_moment
 from torchrl_tsallis.objectives.bc import TsallisBCLoss
+from torchrl_tsallis.objectives.distributed import GlobalSum
 from torchrl_tsallis.objectives.reference import MixtureReference
 from torchrl_tsallis.optim import AdaTerm
 
@@ -77,6 +78,7 @@ def q_gradient(
     gamma_max: float | Tensor = 0.9,
     gamma: float | Tensor | None = None,
     mask: Tensor | None = None,
+    total: GlobalSum | None = None,
 ) -> tuple[Tensor, Tensor]:
     r"""Value and derivative of :func:`q_objective`, written out: a third of autograd's cost.
 
@@ -94,6 +96,7 @@ def q_gradient(
         gamma_max: as there.
         gamma: as there.
         mask: valid samples, ``[*S, B]`` bool. Default: all of them.
+        total: sums over the processes of data-parallel training. Default: None, there is only one.
 
     Returns:
         The objective and its derivative with respect to phi, ``[*S]`` each, without graph.
@@ -108,13 +111,15 @@ def q_gradient(
         u = (1 - share).mul_(1 - q_min)  # 1 - q
         exponent = u.unsqueeze(-1) * log_prob
         density = exponent.clamp(max=MAX_EXPONENT).exp_()
-        if mask is None:
-            moment = density.mean(-1)
-            slope = -density.mul_(log_prob).where(exponent <= MAX_EXPONENT, 0.0).mean(-1)
+        slopes = (density * log_prob).where(exponent <= MAX_EXPONENT, 0.0)
+        if mask is None and total is None:
+            moment, slope = density.mean(-1), -slopes.mean(-1)
         else:
-            count = mask.sum(-1).clamp_min(1)
-            moment = density.where(mask, 0.0).sum(-1) / count
-            slope = -density.mul_(log_prob).where(mask & (exponent <= MAX_EXPONENT), 0.0).sum(-1) / count
+            valid = torch.ones_like(density, dtype=torch.bool) if mask is None else mask
+            sums = density.where(valid, 0.0).sum(-1), slopes.where(valid, 0.0).sum(-1), valid.sum(-1)
+            moment, slope, count = sums if total is None else total(*sums)
+            count = count.clamp_min(1).to(moment)
+            moment, slope = moment / count, -slope / count
         if gamma is None:
             rest = moment.clamp(1 - gamma_max, 1 - gamma_min)  # type: ignore[arg-type]  # 1 - gamma
             slope = slope.where(rest != moment, 0.0)
@@ -139,6 +144,9 @@ class QTuner(TrainerHookBase):
     lambda      multiplier   100      section V-B
     step size   lr           1e-3     as the policy's
     ==========  ===========  =======  ============
+
+    In data-parallel training the moment and its slope are those of all processes' samples, so that q is the same in
+    each of them.
 
     With S stacked members there is one phi for each, ``[S]``; ``tuned`` says whose q moves.
 
@@ -226,6 +234,7 @@ class QTuner(TrainerHookBase):
             gamma_min=gamma_min,
             gamma_max=gamma_max,
             mask=self.loss.last_mask if log_prob is None else None,
+            total=self.loss.global_sum,
         )
         if self.tuned is not None:
             objective, slope = objective.where(self.tuned, 0.0), slope.where(self.tuned, 0.0)
