@@ -4,5 +4,6 @@ from __future__ import annotations
 
 from torchrl_tsallis.modules.activations import Squish, squareplus, squish
 from torchrl_tsallis.modules.policy import NormalHead, make_policy
+from torchrl_tsallis.modules.recurrent import NoisyLSTM, make_recurrent_policy
 
-__all__ = ["NormalHead", "Squish", "make_policy", "squareplus", "squish"]
+__all__ = ["NoisyLSTM", "NormalHead", "Squish", "make_policy", "make_recurrent_policy", "squareplus", "squish"]
