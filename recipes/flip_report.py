@@ -8,8 +8,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from ant_report import as_markdown, read_scalars
 from safetensors.numpy import load_file
+from torch import Tensor
 
 from torchrl_tsallis._io import atomic_path
 from torchrl_tsallis.evaluation import auroc, bootstrap_interval, error_curves, flip_trajectories, ratings_over_time
@@ -17,6 +19,11 @@ from torchrl_tsallis.evaluation.plots import schedule
 from torchrl_tsallis.trainers import make_logger
 
 COLUMNS = ("method", "seed", "trial", "flips", "events", "singles", "multiples", "run", "success")
+
+
+def faults_of(data: Any) -> dict[str, Tensor]:
+    """The labelled faults of demonstrations, masks ``[N]``; training never sees them."""
+    return {name: value for name, value in data["info"].items() if value.dtype == torch.bool}
 
 
 def save_rows(path: str | Path, rows: Sequence[Mapping[str, Any]]) -> None:
@@ -49,10 +56,11 @@ def errors_of(output: Path, method: str) -> tuple[list[int], np.ndarray]:
     return steps, np.array([[curve[step] for step in steps] for curve in curves])
 
 
-def detection(folder: Path) -> float:
-    """AUROC of a training's rating: the steps without a labelled fault against those with one."""
+def detection(folder: Path) -> float | None:
+    """AUROC of a training's rating: the steps without a labelled fault against those with one, where there are any."""
     file = load_file(folder / "ratings.safetensors")
-    return auroc(file["rating"][~file["is_noise"]], file["rating"][file["is_noise"]])
+    fault = file["is_noise"]
+    return auroc(file["rating"][~fault], file["rating"][fault]) if fault.any() and not fault.all() else None
 
 
 def summarise(rows: Sequence[Mapping[str, Any]], output: Path) -> list[dict[str, str]]:
@@ -71,7 +79,7 @@ def summarise(rows: Sequence[Mapping[str, Any]], output: Path) -> list[dict[str,
         steps, errors = errors_of(output, method)
         line["final MSE [N^2]"] = f"{np.median(errors[:, -1]):.4g}" if steps else "-"
         folders = [f for f in sorted(output.glob(f"seed_*/{method}")) if (f / "ratings.safetensors").exists()]
-        scores = [detection(folder) for folder in folders]
+        scores = [score for score in map(detection, folders) if score is not None]
         line["AUROC fault"] = f"{np.mean(scores):.3f}" if scores else "-"
         table.append(line)
     return table

@@ -23,7 +23,7 @@ import hydra
 import numpy as np
 import torch
 from collect_flip import collect_flips
-from flip_report import read_rows, report, save_rows
+from flip_report import faults_of, read_rows, report, save_rows
 from hydra.utils import instantiate
 from omegaconf import DictConfig, ListConfig, OmegaConf
 from safetensors.torch import load_file, save_file
@@ -141,11 +141,6 @@ def train(unit: Unit, cfg: DictConfig) -> None:
     state = {name: value.contiguous() for name, value in actor.state_dict().items()} | scaling.state_dict()
     with atomic_path(folder / "policy.safetensors") as path:  # last: it marks the training as done
         save_file(state, path)
-
-
-def faults_of(data: Any) -> dict[str, torch.Tensor]:
-    """The labelled faults of demonstrations, masks ``[N]``; for the report alone."""
-    return {name: value for name, value in data["info"].items() if value.dtype == torch.bool}
 
 
 def flip(unit: Unit, cfg: DictConfig) -> None:

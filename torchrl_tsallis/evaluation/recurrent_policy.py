@@ -10,7 +10,8 @@ import numpy as np
 
 def _array(value: Any) -> np.ndarray:
     """Copies a tensor or array to float32."""
-    return np.array(value.detach().cpu() if hasattr(value, "detach") else value, dtype=np.float32)
+    value = value.detach().cpu().float().numpy() if hasattr(value, "detach") else value
+    return np.array(value, dtype=np.float32)
 
 
 class RecurrentMeanPolicy:
