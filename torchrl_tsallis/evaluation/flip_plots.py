@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from torchrl_tsallis._io import atomic_path
-from torchrl_tsallis.evaluation.plots import PALETTE
+from torchrl_tsallis.evaluation.plots import PALETTE, _not_empty
 from torchrl_tsallis.evaluation.statistics import _checked, bootstrap_interval
 
 
@@ -134,8 +134,7 @@ def error_curves(
         >>> error_curves({"BC": ([1, 2], [[0.3, 0.2], [0.4, 0.1]])}, tempfile.mkdtemp() + "/mse.png").name
         'mse.png'
     """
-    if not errors:
-        raise ValueError("nothing to draw: the mapping is empty")
+    _not_empty(errors)
     figure = _figure(6.0, 3.6)
     axes = figure.subplots()
     seeds = 0
@@ -187,8 +186,7 @@ def flip_trajectories(
         >>> flip_trajectories({"BC": trial}, tempfile.mkdtemp() + "/paths.png").name
         'paths.png'
     """
-    if not trials:
-        raise ValueError("nothing to draw: the mapping is empty")
+    _not_empty(trials)
     figure = _figure(3.0 * len(trials) + 0.6, 3.2)
     all_axes = figure.subplots(1, len(trials), sharex=True, sharey=True, squeeze=False)[0]
     for axes, colour, (name, trial) in zip(all_axes, PALETTE, trials.items(), strict=False):
@@ -237,8 +235,7 @@ def ratings_over_time(
         >>> ratings_over_time({"proposal": np.ones(5)}, tempfile.mkdtemp() + "/ratings.png").name
         'ratings.png'
     """
-    if not ratings:
-        raise ValueError("nothing to draw: the mapping is empty")
+    _not_empty(ratings)
     curves = {name: _checked(value, f"ratings[{name!r}]") for name, value in ratings.items()}
     bands = {name: np.asarray(value, dtype=bool) for name, value in (faults or {}).items()}
     length = len(next(iter(curves.values())))

@@ -78,12 +78,17 @@ def run_flip_trial(policy: Any, seed: int, *, make_env: Callable[[], Any] | None
         ValueError: if the policy's force has a wrong shape or is not finite; the message names step and seed.
     """
     if make_env is None:
-        from torchrl_tsallis.envs.page_flip import make_page_flip as make_env
+        from torchrl_tsallis.envs.page_flip import make_page_flip
+
+        make_env = make_page_flip
     env = make_env()
     try:
         observation, info = env.reset(seed=seed)
         getattr(policy, "reset", lambda: None)()
-        positions, forces, angles, over = [], [], [info["edge_angles"]], False
+        positions: list[np.ndarray] = []
+        forces: list[np.ndarray] = []
+        angles: list[np.ndarray] = [info["edge_angles"]]
+        over = False
         while not over:
             force = np.asarray(policy(observation))
             if force.shape != (3,) or not np.isfinite(force).all():
