@@ -84,9 +84,7 @@ def train(unit: Unit, cfg: DictConfig) -> None:
         buffer.append_transform(lambda batch: batch.to(cfg.device))
     epoch = len(members[0]) // cfg.batch_size
     folder = unit.folder
-    logger = make_logger(
-        cfg.logger, folder, "log", group=f"std_{unit.std:g}/{unit.task}", tags=[unit.task, folder.name]
-    )
+    logger = make_logger(cfg.log, folder, "log", group=f"std_{unit.std:g}/{unit.task}", tags=[unit.task, folder.name])
     trainer = instantiate(cfg.trainer, _partial_=True)(
         loss=loss,
         replay_buffer=buffer,

@@ -14,14 +14,16 @@ from hydra import compose, initialize_config_dir
 from hydra.utils import instantiate
 from omegaconf import OmegaConf
 
-from torchrl_tsallis import AdaTerm, CATSoftUpdate, QTuner, TsallisBCLoss
+from torchrl_tsallis import AdaTerm, CATSoftUpdate, PredictiveBCLoss, QTuner, TsallisBCLoss
 from torchrl_tsallis.data import make_replay_buffer
-from torchrl_tsallis.modules import make_policy
+from torchrl_tsallis.modules import make_policy, make_recurrent_policy
 from torchrl_tsallis.trainers import configs, make_offline_trainer
 
 PAIRS = [
     (configs.PolicyConfig, make_policy, set()),
+    (configs.RecurrentPolicyConfig, make_recurrent_policy, set()),
     (configs.TsallisBCLossConfig, TsallisBCLoss, set()),
+    (configs.PredictiveBCLossConfig, PredictiveBCLoss, set()),
     (configs.CATSoftUpdateConfig, CATSoftUpdate, {"loss_module"}),
     (configs.AdaTermConfig, AdaTerm, {"params"}),
     (configs.QTunerConfig, QTuner, {"loss"}),

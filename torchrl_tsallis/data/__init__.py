@@ -12,6 +12,7 @@ from torchrl_tsallis.data.demonstrations import (
 from torchrl_tsallis.data.flip_demonstrations import record_flips, replay_forces
 from torchrl_tsallis.data.policy import NumpyPolicy, load_policy
 from torchrl_tsallis.data.replay import make_replay_buffer
+from torchrl_tsallis.data.sequences import Scaling, make_sequence_buffer, split_trajectories
 from torchrl_tsallis.data.stacked import MemberSampler, make_stacked_replay_buffer
 from torchrl_tsallis.data.teleoperation import FlipOperator
 
@@ -20,10 +21,12 @@ __all__ = [
     "FlipOperator",
     "MemberSampler",
     "NumpyPolicy",
+    "Scaling",
     "add_action_noise",
     "load_demonstrations",
     "load_policy",
     "make_replay_buffer",
+    "make_sequence_buffer",
     "make_stacked_replay_buffer",
     "make_task",
     "record_flips",
@@ -31,5 +34,6 @@ __all__ = [
     "replace_with_amateur",
     "replay_forces",
     "save_demonstrations",
+    "split_trajectories",
     "validate_demonstrations",
 ]

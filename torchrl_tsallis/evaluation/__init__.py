@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from torchrl_tsallis.evaluation.flip_plots import force_over_time
+from torchrl_tsallis.evaluation.flip_plots import error_curves, flip_trajectories, force_over_time, ratings_over_time
+from torchrl_tsallis.evaluation.flip_trials import FlipTrial, longest_single_run, run_flip_trial
 from torchrl_tsallis.evaluation.grid_plots import returns_grid
 from torchrl_tsallis.evaluation.mean_policy import MeanPolicy
 from torchrl_tsallis.evaluation.plots import auroc_bars, rating_histogram, return_by_method, schedule
+from torchrl_tsallis.evaluation.recurrent_policy import RecurrentMeanPolicy
 from torchrl_tsallis.evaluation.rollouts import evaluate_policies
 from torchrl_tsallis.evaluation.statistics import (
     auroc,
@@ -18,19 +20,26 @@ from torchrl_tsallis.evaluation.statistics import (
 from torchrl_tsallis.evaluation.video import record_rollout
 
 __all__ = [
+    "FlipTrial",
     "MeanPolicy",
+    "RecurrentMeanPolicy",
     "auroc",
     "auroc_bars",
     "bootstrap_interval",
+    "error_curves",
     "evaluate_policies",
+    "flip_trajectories",
     "force_over_time",
     "improvement_interval",
     "iqm",
+    "longest_single_run",
     "median",
     "probability_of_improvement",
     "rating_histogram",
+    "ratings_over_time",
     "record_rollout",
     "return_by_method",
     "returns_grid",
+    "run_flip_trial",
     "schedule",
 ]

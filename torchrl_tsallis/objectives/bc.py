@@ -60,7 +60,9 @@ class TsallisBCLoss(LossModule):
     gamma = 0, tuned q              ``gamma_mix=0.0`` and a :class:`~torchrl_tsallis.QTuner`
     ==============================  ==========================================================
 
-    Reads the observation keys of the actor and ``action`` (``[*B, A]``). Writes the keys below; all but the loss are
+    Reads the observation keys of the actor and ``action`` (``[*B, A]``). A recurrent actor takes sequences
+    ``[*B, T]``, of which every step is rated; its state, which it writes under ``next``, is read where it is given and
+    zero where it is not. Writes the keys below; all but the loss are
     detached scalars, or ``[S]``.
 
     ====================  =====================================================================
@@ -192,6 +194,13 @@ class TsallisBCLoss(LossModule):
     def _forward_value_estimator_keys(self, **kwargs: NestedKey) -> None:
         """Behavioral cloning has no value estimator to forward the keys to."""
 
+    def train(self, mode: bool = True) -> TsallisBCLoss:
+        """Sets the actor's mode too, which decides about dropout and noise; TorchRL keeps it out of its children."""
+        super().train(mode)
+        if "actor_network" in self.__dict__:
+            self.actor_network.train(mode)
+        return self
+
     def set_keys(self, **kwargs: NestedKey | None) -> None:
         """Sets the tensordict keys; see :class:`_AcceptedKeys`."""
         super().set_keys(**kwargs)
@@ -267,13 +276,17 @@ class TsallisBCLoss(LossModule):
             )
         if 0 in tensordict.shape:
             raise ValueError(f"the batch of shape {list(tensordict.shape)} is empty: pass at least one sample")
-        missing = [key for key in self.in_keys if key not in tensordict.keys(True)]
+        keys = tensordict.keys(True)
+        carried = {
+            key for key in self.actor_network.in_keys if unravel_key(("next", key)) in self.actor_network.out_keys
+        }
+        missing = [key for key in self.in_keys if key not in keys and key not in carried]
         if missing:
             raise KeyError(
                 f"the batch has no {missing[0]!r}; it holds {sorted(map(str, tensordict.keys(True, True)))}. "
                 f"Name the action's key by loss.set_keys(action=...) and the observations' by the actor's in_keys"
             )
-        inputs = tensordict.select(*self.in_keys)
+        inputs = tensordict.select(*self.in_keys, strict=False)
         if mask is not None:
             # Padding may hold NaN, which would reach the weights' gradients through 0 * NaN in the network.
             inputs = inputs.apply(lambda x: x.where(expand_right(mask, x.shape), torch.zeros_like(x)))

@@ -6,7 +6,9 @@ Importing this module registers them in Hydra's ``ConfigStore`` (needs ``hydra-c
 group                   name             builds
 ======================  ===============  =======================================================
 ``model``               ``tsallis_bc``   :func:`~torchrl_tsallis.modules.make_policy`
+``model``               ``recurrent``    :func:`~torchrl_tsallis.modules.make_recurrent_policy`
 ``loss``                ``tsallis_bc``   :class:`~torchrl_tsallis.TsallisBCLoss`
+``loss``                ``predictive``   :class:`~torchrl_tsallis.PredictiveBCLoss`
 ``target_net_updater``  ``cat_soft``     :class:`~torchrl_tsallis.CATSoftUpdate`
 ``optimizer``           ``adaterm``      :class:`~torchrl_tsallis.AdaTerm`
 ``tuner``               ``q_tuner``      :class:`~torchrl_tsallis.QTuner`
@@ -43,7 +45,7 @@ from torchrl.trainers import Trainer
 from torchrl.trainers.algorithms.configs.common import ConfigBase
 from torchrl.trainers.algorithms.configs.objectives import LossConfig, TargetNetUpdaterConfig
 
-from torchrl_tsallis.objectives import TsallisBCLoss
+from torchrl_tsallis.objectives import PredictiveBCLoss, TsallisBCLoss
 from torchrl_tsallis.trainers.offline import make_offline_trainer
 
 
@@ -64,6 +66,26 @@ class PolicyConfig(ConfigBase):
 
 
 @dataclass
+class RecurrentPolicyConfig(ConfigBase):
+    """Configuration of :func:`~torchrl_tsallis.modules.make_recurrent_policy`."""
+
+    obs_dim: int = MISSING
+    action_dim: int = MISSING
+    hidden_size: int = 100
+    num_layers: int = 2
+    state_noise: float = 1e-3
+    min_scale: float = 0.0
+    observation_key: Any = "observation"
+    action_key: Any = "action"
+    prediction_key: Any = "predicted_observation"
+    _target_: str = "torchrl_tsallis.modules.make_recurrent_policy"
+    _convert_: str = "all"
+
+    def __post_init__(self) -> None:
+        """Nothing to check: the factory does."""
+
+
+@dataclass
 class TsallisBCLossConfig(LossConfig):
     """Configuration of :class:`~torchrl_tsallis.TsallisBCLoss`."""
 
@@ -77,6 +99,14 @@ class TsallisBCLossConfig(LossConfig):
     sync_stats: bool = True
     process_group: Any = None
     _target_: str = "torchrl_tsallis.trainers.configs.make_loss"
+
+
+@dataclass
+class PredictiveBCLossConfig(TsallisBCLossConfig):
+    """Configuration of :class:`~torchrl_tsallis.PredictiveBCLoss`."""
+
+    prediction_weight: float = 1.0
+    _target_: str = "torchrl_tsallis.trainers.configs.make_predictive_loss"
 
 
 @dataclass
@@ -159,6 +189,11 @@ def make_loss(actor_network: Any, **settings: Any) -> TsallisBCLoss:
     return TsallisBCLoss(actor_network() if isinstance(actor_network, partial) else actor_network, **settings)
 
 
+def make_predictive_loss(actor_network: Any, **settings: Any) -> PredictiveBCLoss:
+    """Builds the loss with the prediction; the actor may come as a partial."""
+    return PredictiveBCLoss(actor_network() if isinstance(actor_network, partial) else actor_network, **settings)
+
+
 def make_trainer(
     loss: TsallisBCLoss, *, optimizer: Any, updater: Any = None, tuner: Any = None, **rest: Any
 ) -> Trainer:
@@ -177,7 +212,9 @@ def register() -> None:
     store = ConfigStore.instance()
     for group, name, node in (
         ("model", "tsallis_bc", PolicyConfig),
+        ("model", "recurrent", RecurrentPolicyConfig),
         ("loss", "tsallis_bc", TsallisBCLossConfig),
+        ("loss", "predictive", PredictiveBCLossConfig),
         ("target_net_updater", "cat_soft", CATSoftUpdateConfig),
         ("optimizer", "adaterm", AdaTermConfig),
         ("tuner", "q_tuner", QTunerConfig),

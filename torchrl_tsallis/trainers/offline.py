@@ -86,16 +86,16 @@ class SampleHook(TrainerHookBase):
     def state_dict(self) -> dict[str, Any]:
         """State of the sampler and of its generator; the data itself is not saved."""
         rng = self.replay_buffer.sampler._rng
-        state = {"sampler": dict(self.replay_buffer.sampler.state_dict())}
+        state = {"sampler": dict(self.replay_buffer.sampler.state_dict()), "samples": len(self.replay_buffer)}
         return state if rng is None else {**state, "rng": rng.get_state()}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Restores the state."""
         sampler = self.replay_buffer.sampler
-        length = state_dict["sampler"].get("len_storage")
-        if length and int(length) != len(self.replay_buffer):
+        samples = int(state_dict["samples"])
+        if samples != len(self.replay_buffer):
             raise ValueError(
-                f"the checkpoint was made with {int(length)} samples, the buffer holds {len(self.replay_buffer)}: "
+                f"the checkpoint was made with {samples} samples, the buffer holds {len(self.replay_buffer)}: "
                 "resume with the same data, or start anew in another output folder"
             )
         sampler.load_state_dict(state_dict["sampler"])
