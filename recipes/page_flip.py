@@ -62,7 +62,7 @@ def folder_of(unit: Unit, cfg: DictConfig) -> Path:
 def unit_logger(unit: Unit, cfg: DictConfig) -> LoggerGroup:
     """The loggers of a training; opened again, they continue its run."""
     folder = folder_of(unit, cfg)
-    return make_logger(cfg.logger, folder.parent, unit[1], group=f"page_flip/{unit[1]}", tags=["page_flip", unit[1]])
+    return make_logger(cfg.log, folder.parent, unit[1], group=f"page_flip/{unit[1]}", tags=["page_flip", unit[1]])
 
 
 def demonstrations(cfg: DictConfig, progress: bool = False) -> tuple[Any, Any]:
@@ -189,7 +189,7 @@ def main(cfg: DictConfig) -> None:
     rows = [row for folder in folders.values() for row in read_rows(folder / "trials.csv")]
     save_rows(cfg.results, rows)
     epoch = len(parts[0]) // cfg.data.steps // cfg.num_slices
-    text = report(rows, Path(cfg.output), Path(cfg.pictures), cfg.logger, steps=cfg.data.steps, epoch=epoch)
+    text = report(rows, Path(cfg.output), Path(cfg.pictures), cfg.log, steps=cfg.data.steps, epoch=epoch)
     minutes = (time.monotonic() - start) / 60
     print(f"\n{text}\n{minutes:.1f} minutes; raw results in {cfg.results}, pictures in {cfg.pictures}")
 
