@@ -43,19 +43,18 @@ def train(members: int, steps: int, threads: int) -> dict[str, float]:
 
 
 def evaluate(workers: int, environments: int, episodes: int) -> dict[str, float]:
-    """Environment steps per second of a policy that stands, by the wall clock, after the workers' start."""
-    import numpy as np
-
-    from torchrl_tsallis.evaluation import MeanPolicy, evaluate_policies, rollouts
+    """Environment steps per second of an expert, by the wall clock, after the workers' start."""
+    from torchrl_tsallis.data import load_policy
+    from torchrl_tsallis.evaluation import evaluate_policies, rollouts
 
     rollouts.GROUP = environments  # of this process alone: with workers, they get it by their groups' sizes
-    zero = MeanPolicy([(np.zeros((100, 28)), np.zeros(100), None), (np.zeros((16, 100)), np.zeros(16), None)])
+    policy = load_policy("expert_0")  # walks for most of the 1000 steps
     # The same start, with one episode a worker, is taken off.
     spent = []
     lengths = 0
     for count in (workers or 1, (workers or 1) + episodes):
         start = time.perf_counter()
-        rows = evaluate_policies({"zero": zero}, episodes=count, workers=workers, progress=False)
+        rows = evaluate_policies({"expert": policy}, episodes=count, workers=workers, progress=False)
         spent.append(time.perf_counter() - start)
         lengths = sum(row["length"] for row in rows) - lengths
     return {"rate": lengths / max(spent[1] - spent[0], 1e-9)}
