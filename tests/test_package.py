@@ -31,7 +31,7 @@ print(*torchrl_tsallis.__all__)
 def test_the_core_imports_without_the_extras():
     done = subprocess.run([sys.executable, "-c", BLOCKED], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
-    assert done.stdout.split() == ["AdaTerm", "CATSoftUpdate", "QTuner", "TsallisBCLoss", "__version__"]
+    assert {"AdaTerm", "CATSoftUpdate", "QTuner", "TsallisBCLoss"} <= set(done.stdout.split())
 
 
 @pytest.mark.filterwarnings("ignore")  # BCLoss and the legacy defaults of the trainer warn

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from tensordict import TensorDictBase, TensorDictParams
@@ -41,7 +41,8 @@ class PredictiveBCLoss(TsallisBCLoss):
 
     Keyword Args:
         prediction_weight (float): beta, not negative. Default: 1.0.
-        q, gamma_mix, gamma_min, gamma_max, reference, reduction: as for :class:`~torchrl_tsallis.TsallisBCLoss`.
+        q, gamma_mix, gamma_min, gamma_max, reference, reduction, sync_stats, process_group: as for
+            :class:`~torchrl_tsallis.TsallisBCLoss`.
 
     Raises:
         ValueError: for a negative weight, an actor that writes no prediction, or stacked members.
@@ -89,6 +90,8 @@ class PredictiveBCLoss(TsallisBCLoss):
         gamma_max: float = 0.9,
         reference: ReferenceDensity | None = None,
         reduction: Literal["mean", "sum", "none"] | None = None,
+        sync_stats: bool = True,
+        process_group: Any = None,
     ) -> None:
         if not prediction_weight >= 0:
             raise ValueError(f"prediction_weight must not be negative, got {prediction_weight}")
@@ -100,6 +103,8 @@ class PredictiveBCLoss(TsallisBCLoss):
             gamma_max=gamma_max,
             reference=reference,
             reduction=reduction,
+            sync_stats=sync_stats,
+            process_group=process_group,
         )
         if self.num_members is not None:
             raise ValueError("PredictiveBCLoss has one policy: torch.vmap cannot stack LSTM layers")
