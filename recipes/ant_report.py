@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import csv
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -129,15 +129,21 @@ def save_plots(rows: Sequence[Mapping[str, Any]], output: Path, pictures: Path) 
     return paths
 
 
-def report(rows: Sequence[Mapping[str, Any]], output: Path, pictures: Path, kind: str) -> str:
-    """Writes ``table.md`` and the pictures, logs them as a run named summary, and returns the table's text."""
-    table = summarise(rows, output)
+def publish(
+    table: Sequence[Mapping[str, str]], draw: Callable[[], list[Path]], output: Path, pictures: Path, kind: str
+) -> str:
+    """Writes ``table.md`` and what ``draw`` makes, logs them as a run named summary, and returns the table's text."""
     text = as_markdown(table)
     with atomic_path(pictures / "table.md") as path:
         path.write_text(text, encoding="utf-8")
     logger = make_logger(kind, output, "summary", group="summary")
     logger.log_table("results", table)
-    for picture in save_plots(rows, output, pictures):
+    for picture in draw():
         logger.log_picture(picture.stem, picture)
     logger.shutdown()
     return text
+
+
+def report(rows: Sequence[Mapping[str, Any]], output: Path, pictures: Path, kind: str) -> str:
+    """Publishes the table and the pictures of all tasks; returns the table's text."""
+    return publish(summarise(rows, output), lambda: save_plots(rows, output, pictures), output, pictures, kind)

@@ -9,14 +9,13 @@ from typing import Any
 
 import numpy as np
 import torch
-from ant_report import as_markdown, read_scalars
+from ant_report import publish, read_scalars
 from safetensors.numpy import load_file
 from torch import Tensor
 
 from torchrl_tsallis._io import atomic_path
 from torchrl_tsallis.evaluation import auroc, bootstrap_interval, error_curves, flip_trajectories, ratings_over_time
 from torchrl_tsallis.evaluation.plots import schedule
-from torchrl_tsallis.trainers import make_logger
 
 COLUMNS = ("method", "seed", "trial", "flips", "events", "singles", "multiples", "run", "success")
 
@@ -132,14 +131,7 @@ def save_plots(rows: Sequence[Mapping[str, Any]], output: Path, pictures: Path, 
 def report(
     rows: Sequence[Mapping[str, Any]], output: Path, pictures: Path, kind: str, *, steps: int, epoch: int
 ) -> str:
-    """Writes ``table.md`` and the pictures, logs them as a run named summary, and returns the table's text."""
-    table = summarise(rows, output)
-    text = as_markdown(table)
-    with atomic_path(pictures / "table.md") as path:
-        path.write_text(text, encoding="utf-8")
-    logger = make_logger(kind, output, "summary", group="summary")
-    logger.log_table("results", table)
-    for picture in save_plots(rows, output, pictures, steps, epoch):
-        logger.log_picture(picture.stem, picture)
-    logger.shutdown()
-    return text
+    """Publishes the table and the pictures; returns the table's text."""
+    return publish(
+        summarise(rows, output), lambda: save_plots(rows, output, pictures, steps, epoch), output, pictures, kind
+    )
