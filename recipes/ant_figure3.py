@@ -78,6 +78,8 @@ def train(unit: Unit, cfg: DictConfig) -> None:
     tuned = [bool(method.tune_q) for method in settings]
     levels = {"q": [method.q for method in settings], "gamma_mix": [method.gamma_mix for method in settings]}
     loss = instantiate(cfg.loss, _partial_=True)(actor_network=actors, **levels).to(cfg.device)
+    if cfg.compile is not None:
+        loss.compile(**cfg.compile)
     members = [data[seed] for seed in seeds]
     buffer = make_stacked_replay_buffer(members, seeds=seeds, batch_size=cfg.batch_size)
     if torch.device(cfg.device).type != "cpu":

@@ -11,7 +11,6 @@ Methods and seeds are overrides, one or a list; ``resume=true`` continues an int
 
 from __future__ import annotations
 
-import json
 import shutil
 import time
 from functools import partial
@@ -22,10 +21,11 @@ from typing import Any
 import hydra
 import numpy as np
 import torch
+from ant_common import as_list, keep_settings
 from collect_flip import collect_flips
 from flip_report import faults_of, read_rows, report, save_rows
 from hydra.utils import instantiate
-from omegaconf import DictConfig, ListConfig, OmegaConf
+from omegaconf import DictConfig, OmegaConf
 from safetensors.torch import load_file, save_file
 from torchrl._utils import logger as torchrl_logger
 from torchrl.modules import set_recurrent_mode
@@ -39,11 +39,8 @@ from torchrl_tsallis.evaluation import RecurrentMeanPolicy, record_rollout, run_
 from torchrl_tsallis.trainers import EvaluationHook, LoggerGroup, make_logger, resume
 
 Unit = tuple[int, str]  # seed, method: one training
-
-
-def as_list(value: Any) -> list[Any]:
-    """One value or a list of them, as a list."""
-    return list(value) if isinstance(value, (list, ListConfig)) else [value]
+#: The entries of the configuration that decide about a policy and its trials.
+SETTINGS = ("policy", "loss", "tuner", "optimizer", "updater", "data", "trials", "epochs", "slice_len", "num_slices")
 
 
 def units_of(cfg: DictConfig) -> list[Unit]:
@@ -75,17 +72,11 @@ def demonstrations(cfg: DictConfig, progress: bool = False) -> tuple[Any, Any]:
 
 def check_settings(units: list[Unit], cfg: DictConfig) -> None:
     """Keeps each training's settings in its folder; a resumed one must have the same."""
-    names = ("policy", "loss", "tuner", "optimizer", "updater", "data", "trials", "epochs", "slice_len", "num_slices")
     every = OmegaConf.to_container(cfg, resolve=True)
     for unit in units:
-        file = folder_of(unit, cfg) / "settings.json"
-        wanted = json.loads(json.dumps({name: every[name] for name in names} | every["methods"][unit[1]]))
-        before = json.loads(file.read_text()) if file.exists() else wanted
-        changed = [name for name in wanted if before.get(name) != wanted[name]]
-        if changed:
-            raise SystemExit(f"{file} was made with other {', '.join(changed)}: choose another output, or resume=false")
-        with atomic_path(file) as path:
-            path.write_text(json.dumps(wanted, indent=1))
+        method = every["methods"][unit[1]]
+        names = (*SETTINGS, *method)
+        keep_settings(folder_of(unit, cfg) / "settings.json", every | method, names, "resume=false")
 
 
 def errors(actor: Any, data: Any, unit: float) -> dict[str, float]:

@@ -16,22 +16,24 @@ gamma        gamma            relative rating level in [0, 1]; 0 is the absolute
 
 from __future__ import annotations
 
-import math
-from typing import Any
-
 import torch
 from torch import Tensor
 
-#: Exponents are cut here: ``exp(64)`` still sums over 1e10 samples in float32 without overflowing.
-MAX_EXPONENT = 64.0
-_SERIES_TERMS = 20
+from torchrl_tsallis.q_logarithm import MAX_EXPONENT, _QLogarithm, as_like, exp_q, ln_q
 
-
-def _like(value: float | Tensor, reference: Tensor) -> Tensor:
-    """``value`` as a tensor of the reference's dtype and device."""
-    if isinstance(value, Tensor):
-        return value.to(reference)
-    return torch.full((), value, dtype=reference.dtype, device=reference.device)
+__all__ = [
+    "MAX_EXPONENT",
+    "adaptive_gamma",
+    "bound_ratio",
+    "density_moment",
+    "exp_q",
+    "ln_q",
+    "log_mixture",
+    "per_sample",
+    "rated_nll",
+    "rating",
+    "tsallis_nll",
+]
 
 
 def per_sample(value: Tensor, samples: Tensor) -> Tensor:
@@ -51,97 +53,6 @@ def per_sample(value: Tensor, samples: Tensor) -> Tensor:
     return value[(...,) + (None,) * (samples.ndim - value.ndim)] if value.ndim else value
 
 
-def _phi1_derivative(z: Tensor) -> Tensor:
-    """d/dz of (exp(z) - 1) / z, by its series near 0 where the closed form cancels."""
-    near = z.abs() < 1
-    small = torch.where(near, z, 0.0)
-    series = torch.zeros_like(z)
-    for k in range(_SERIES_TERMS, 0, -1):  # sum over k >= 1 of k z^(k-1) / (k+1)!
-        series = series * small + k / math.factorial(k + 1)
-    large = torch.where(near, 1.0, z)
-    return torch.where(near, series, (large * large.exp() - large.expm1()) / large.square())
-
-
-class _LnQ(torch.autograd.Function):
-    """q-logarithm of exp(log_x), with gradients that do not cancel (autograd's own would lose exp(z) << 1)."""
-
-    generate_vmap_rule = True
-
-    @staticmethod
-    def forward(log_x: Tensor, q: Tensor) -> Tensor:
-        u = 1 - q
-        z = (u * log_x).clamp(max=MAX_EXPONENT)
-        return torch.where(u == 0, log_x, z.expm1() / torch.where(u == 0, 1.0, u))
-
-    @staticmethod
-    def setup_context(ctx: Any, inputs: tuple[Tensor, Tensor], output: Tensor) -> None:
-        ctx.save_for_backward(*inputs)
-
-    @staticmethod
-    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, Tensor | None]:
-        log_x, q = ctx.saved_tensors
-        z = ((1 - q) * log_x).clamp(max=MAX_EXPONENT)
-        by_log_x = grad * z.exp() if ctx.needs_input_grad[0] else None
-        by_q = None
-        if ctx.needs_input_grad[1]:
-            # Past the cut the value is constant in z, so that its slope in u = 1 - q is -expm1(z) / u^2.
-            u = 1 - q
-            cut = u * log_x >= MAX_EXPONENT
-            inside = log_x.square() * _phi1_derivative(torch.where(cut, 0.0, z))
-            outside = -z.expm1() / torch.where(cut, u, 1.0).square()
-            by_q = (-grad * torch.where(cut, outside, inside)).sum_to_size(q.shape)
-        return by_log_x, by_q
-
-
-def ln_q(log_x: Tensor, q: float | Tensor) -> Tensor:
-    r"""The q-logarithm (eq. 3) of a number given by its natural logarithm.
-
-    .. math:: \ln_q x = \frac{x^{1-q} - 1}{1-q}, \qquad \ln_1 x = \ln x
-
-    Args:
-        log_x: natural logarithm of x, ``[*B]``.
-        q: Tsallis index, a number or a tensor that broadcasts against ``log_x``.
-
-    Returns:
-        ``ln_q(x)``, ``[*B]``. The exponent is cut at :data:`MAX_EXPONENT`; the gradient with respect to ``log_x`` is
-        the rating ``x^(1-q)`` of eq. 7.
-
-    Examples:
-        >>> ln_q(torch.tensor([0.0, 2.0]).log(), 0.5)
-        tensor([-2.0000,  0.8284])
-        >>> ln_q(torch.tensor(3.0), 1.0)
-        tensor(3.)
-    """
-    q = _like(q, log_x)
-    # Broadcast outside of the Function: its backward then sees log_x in the output's shape.
-    return _LnQ.apply(log_x.expand(torch.broadcast_shapes(log_x.shape, q.shape)), q)
-
-
-def exp_q(y: Tensor, q: float | Tensor) -> Tensor:
-    r"""The q-exponential, the inverse of :func:`ln_q`: ``exp_q(ln_q(x), q) = x``.
-
-    .. math:: \exp_q(y) = [1 + (1-q) y]_+^{1/(1-q)}, \qquad \exp_1(y) = e^y
-
-    Args:
-        y: argument, ``[*B]``.
-        q: Tsallis index, a number or a tensor that broadcasts against ``y``.
-
-    Returns:
-        ``exp_q(y)``, ``[*B]``; 0 below the cut-off ``y = -1/(1-q)``.
-
-    Examples:
-        >>> exp_q(torch.tensor([-2.0, 0.0, 2.0]), 0.5)
-        tensor([0., 1., 4.])
-    """
-    u = 1 - _like(q, y)
-    plain = u == 0
-    base = u * y
-    alive = base > -1
-    log_x = torch.where(alive, base, 0.0).log1p() / torch.where(plain, 1.0, u)
-    log_x = torch.where(plain, y, log_x).clamp(max=MAX_EXPONENT)
-    return torch.where(plain | alive, log_x.exp(), 0.0)
-
-
 def log_mixture(target_log_prob: Tensor, gamma: float | Tensor) -> Tensor:
     r"""Logarithm of the paper's reference density (eq. 10).
 
@@ -158,7 +69,7 @@ def log_mixture(target_log_prob: Tensor, gamma: float | Tensor) -> Tensor:
         >>> log_mixture(torch.tensor([-1e4, 0.0]), 0.5)
         tensor([-0.6931,  0.0000])
     """
-    gamma = _like(gamma, target_log_prob)
+    gamma = as_like(gamma, target_log_prob)
     if not torch.is_grad_enabled():  # the limits are right by themselves, their gradients would not be
         return torch.logaddexp(torch.log1p(-gamma), gamma.log() + target_log_prob)
     inner = (gamma > 0) & (gamma < 1)
@@ -184,7 +95,7 @@ def rating(log_prob: Tensor, log_reference: float | Tensor, q: float | Tensor) -
         >>> rating(torch.tensor([-10.0, 0.0]), 0.0, 0.8)
         tensor([0.1353, 1.0000])
     """
-    return ((1 - _like(q, log_prob)) * (log_prob - log_reference)).clamp(max=MAX_EXPONENT).exp()
+    return ((1 - as_like(q, log_prob)) * (log_prob - log_reference)).clamp(max=MAX_EXPONENT).exp()
 
 
 def tsallis_nll(log_prob: Tensor, log_reference: float | Tensor, q: float | Tensor) -> Tensor:
@@ -208,9 +119,9 @@ def tsallis_nll(log_prob: Tensor, log_reference: float | Tensor, q: float | Tens
         >>> tsallis_nll(torch.tensor([-3.0, 0.5]), 0.0, 1.0)
         tensor([ 3.0000, -0.5000])
     """
-    reference, q = _like(log_reference, log_prob).detach(), _like(q, log_prob)
+    reference, q = as_like(log_reference, log_prob).detach(), as_like(q, log_prob)
     # Without a gradient the plain formula will do; an autograd Function costs four times as much.
-    constant = ln_q(-reference, q) if q.requires_grad else _LnQ.forward(-reference, q)
+    constant = ln_q(-reference, q) if q.requires_grad else _QLogarithm.forward(-reference, q)
     return constant - ln_q(log_prob - reference, q)
 
 
@@ -235,8 +146,8 @@ def rated_nll(log_prob: Tensor, log_reference: float | Tensor, q: float | Tensor
         (tensor([4.3233, 0.9063]), tensor([0.1353, 0.8187]))
     """
     with torch.no_grad():
-        constant, reference = log_prob.detach(), _like(log_reference, log_prob)
-        u = 1 - _like(q, log_prob)
+        constant, reference = log_prob.detach(), as_like(log_reference, log_prob)
+        u = 1 - as_like(q, log_prob)
         plain = u == 0
         z = (u * (constant - reference)).clamp(max=MAX_EXPONENT)
         # ln_q(1 / reference) - ln_q(pi / reference); a reference of 1 has no first part
@@ -272,7 +183,7 @@ def density_moment(log_prob: Tensor, q: float | Tensor, dim: int = -1) -> Tensor
             f"log_prob of shape {list(log_prob.shape)} has no sample along dim {dim}, so that E[pi^(1-q)] does not "
             "exist: pass a batch with at least one sample (check that the mask is not False everywhere)"
         )
-    u = 1 - _like(q, log_prob)
+    u = 1 - as_like(q, log_prob)
     if u.ndim:
         u = u.unsqueeze(dim)
     return (u * log_prob).clamp(max=MAX_EXPONENT).exp().mean(dim)
@@ -323,5 +234,5 @@ def bound_ratio(
         tensor(0.6000)
     """
     if gamma is not None:
-        return moment / (1 - _like(gamma, moment))
+        return moment / (1 - as_like(gamma, moment))
     return moment / moment.clamp(1 - gamma_max, 1 - gamma_min)

@@ -127,6 +127,23 @@ def test_training_goes_on_from_a_checkpoint_to_the_same_policies(recipe, tmp_pat
     assert not (folder / "checkpoints").exists()
 
 
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore::UserWarning:torch")
+def test_a_compiled_loss_trains_the_same_policies(recipe, tmp_path):
+    from safetensors.torch import load_file
+
+    small = ["task=[both]", "method=[bc,proposal]", "seeds=1", "epochs=2", "evaluation.episodes=1"]
+    policies = {}
+    for name in ("null", "{backend: aot_eager}"):  # the path of a C++ compiler or a GPU, without either
+        cfg = config("ant_figure3", tmp_path, *small, f"compile={name}")
+        cfg.output = str(tmp_path / name[:4])
+        recipe.run(cfg)
+        policies[name] = load_file(Path(cfg.output) / "std_0.2" / "both" / "seeds_00-00" / "policies.safetensors")
+    plain, compiled = policies.values()
+    for entry, value in plain.items():
+        torch.testing.assert_close(compiled[entry], value, rtol=1e-3, atol=1e-5)
+
+
 def test_a_second_run_in_the_same_folder_is_refused(recipe, tmp_path):
     with (
         recipe.alone_in(tmp_path),

@@ -8,9 +8,9 @@ from functools import partial
 from typing import Any, Literal, NamedTuple
 
 import torch
-from tensordict import TensorDict, TensorDictBase, TensorDictParams, is_tensor_collection
+from tensordict import TensorDict, TensorDictBase, TensorDictParams
 from tensordict.nn import ProbabilisticTensorDictSequential, dispatch
-from tensordict.utils import NestedKey, expand_right, unravel_key
+from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor, nn
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.modules import set_recurrent_mode
@@ -19,6 +19,7 @@ from torchrl.objectives.common import LossModule
 from torchrl_tsallis.functional import bound_ratio, per_sample, rated_nll, rating
 from torchrl_tsallis.objectives.actor import get_dist, get_stacked_dist, log_prob_of
 from torchrl_tsallis.objectives.distributed import GlobalSum, global_sum, num_processes
+from torchrl_tsallis.objectives.inputs import select_inputs
 from torchrl_tsallis.objectives.members import per_member
 from torchrl_tsallis.objectives.reference import MixtureReference, ReferenceDensity
 from torchrl_tsallis.objectives.statistics import global_means, masked_mean, masked_sum, rating_statistics
@@ -268,37 +269,7 @@ class TsallisBCLoss(LossModule):
         return mask
 
     def _inputs(self, tensordict: TensorDictBase, mask: Tensor | None) -> TensorDictBase:
-        """The actor's inputs and the action alone, checked; the caller's tensordict is never written to."""
-        if self.num_members is not None and tensordict.shape[:1] != (self.num_members,):
-            raise ValueError(
-                f"the batch of shape {list(tensordict.shape)} must have the {self.num_members} members first: "
-                "sample it from make_stacked_replay_buffer, or use tensordict.expand(members, ...)"
-            )
-        if 0 in tensordict.shape:
-            raise ValueError(f"the batch of shape {list(tensordict.shape)} is empty: pass at least one sample")
-        keys = tensordict.keys(True)
-        carried = {
-            key for key in self.actor_network.in_keys if unravel_key(("next", key)) in self.actor_network.out_keys
-        }
-        missing = [key for key in self.in_keys if key not in keys and key not in carried]
-        if missing:
-            raise KeyError(
-                f"the batch has no {missing[0]!r}; it holds {sorted(map(str, tensordict.keys(True, True)))}. "
-                f"Name the action's key by loss.set_keys(action=...) and the observations' by the actor's in_keys"
-            )
-        inputs = tensordict.select(*self.in_keys, strict=False)
-        if mask is not None:
-            # Padding may hold NaN, which would reach the weights' gradients through 0 * NaN in the network.
-            inputs = inputs.apply(lambda x: x.where(expand_right(mask, x.shape), torch.zeros_like(x)))
-        action, observation = (inputs.get(key) for key in self.in_keys[:2])
-        if is_tensor_collection(action) or is_tensor_collection(observation):
-            return inputs
-        if action.is_floating_point() and observation.is_floating_point() and action.dtype != observation.dtype:
-            raise TypeError(
-                f"mixed dtypes: {self.in_keys[0]!r} is {action.dtype}, {self.in_keys[1]!r} is {observation.dtype}; "
-                "convert the data to one of them, for instance by tensordict.float()"
-            )
-        return inputs
+        return select_inputs(tensordict, self.actor_network, self.in_keys, members=self.num_members, mask=mask)
 
     def _dist_log_prob(
         self, inputs: TensorDictBase, params: TensorDictBase
