@@ -63,11 +63,22 @@ def with_interval(result: Mapping[str, Any], digits: int = 0) -> str:
     return f"{value} ({low} to {high})"
 
 
-def line_of(task: str, method: str, returns: np.ndarray, reference: np.ndarray | None) -> dict[str, str]:
-    """A row of the table, of returns ``[S, E]`` or ``[T, S, E]`` and those of BC."""
+def learned(returns: np.ndarray, level: float | None) -> str:
+    """How many policies, of returns ``[*, E]``, have a median return of at least ``level``."""
+    if level is None:
+        return "-"
+    good = np.median(returns, axis=-1) >= level
+    return f"{good.sum()}/{good.size}"
+
+
+def line_of(
+    task: str, method: str, returns: np.ndarray, reference: np.ndarray | None, level: float | None
+) -> dict[str, str]:
+    """A row of the table, of returns ``[S, E]`` or ``[T, S, E]``, those of BC, and the level that means success."""
     line = {"task": task, "method": label_of(method), "seeds x episodes": f"{returns.shape[-2]} x {returns.shape[-1]}"}
     line["median"] = with_interval(bootstrap_interval(returns, median))
     line["IQM"] = with_interval(bootstrap_interval(returns, iqm))
+    line["learned"] = learned(returns, level)
     line["better than BC"] = "-"
     if reference is not None and method != "bc" and returns.shape[-2] > 1:
         result = improvement_interval(np.median(returns, axis=-1), np.median(reference, axis=-1))
@@ -76,9 +87,14 @@ def line_of(task: str, method: str, returns: np.ndarray, reference: np.ndarray |
 
 
 def summarise(scores: Scores) -> list[dict[str, str]]:
-    """The table: every task, and all of them together where the seeds are complete."""
+    """The table: every task, and all of them together where the seeds are complete.
+
+    A policy has learned if its median return is at least half of BC's on the clean task.
+    """
+    best = scores.get("clean", {}).get("bc")
+    level = None if best is None else 0.5 * median(best)
     table = [
-        line_of(task, method, returns, methods.get("bc"))
+        line_of(task, method, returns, methods.get("bc"), level)
         for task, methods in scores.items()
         for method, returns in methods.items()
     ]
@@ -88,7 +104,7 @@ def summarise(scores: Scores) -> list[dict[str, str]]:
         if len({methods[method].shape if method in methods else None for methods in scores.values()}) == 1
     }
     if len(scores) > 1:
-        table += [line_of("all", method, returns, together.get("bc")) for method, returns in together.items()]
+        table += [line_of("all", method, returns, together.get("bc"), level) for method, returns in together.items()]
     return table
 
 

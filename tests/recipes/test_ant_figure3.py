@@ -153,6 +153,21 @@ def test_a_second_run_in_the_same_folder_is_refused(recipe, tmp_path):
         pass
 
 
+def learned_of(rows: list[dict]) -> list[list[bool]]:
+    """By the lines of the table: whether each policy's median is at least half of BC's on the clean task."""
+    from statistics import median
+
+    def median_of(**wanted):
+        return median(row["return"] for row in rows if all(row[k] == v for k, v in wanted.items()))
+
+    level = median_of(method="bc", task="clean") / 2
+    of = {
+        (t, m): [median_of(method=m, task=t, seed=s) >= level for s in range(3)]
+        for t in ("clean", "both") for m in ("bc", "proposal")
+    }  # fmt: skip
+    return [*of.values(), *([*of["clean", m], *of["both", m]] for m in ("bc", "proposal"))]
+
+
 @pytest.mark.slow
 def test_one_command_draws_the_figure_from_the_raw_file_alone(recipe, tmp_path):
     from figure3_report import read_raw, save_raw
@@ -175,12 +190,13 @@ def test_one_command_draws_the_figure_from_the_raw_file_alone(recipe, tmp_path):
     text = (tmp_path / "pictures" / "figure3.md").read_text()
     assert text in done.stdout
     table = [[cell.strip() for cell in line.split("|")[1:-1]] for line in text.splitlines() if line.startswith("|")]
-    assert table[0] == ["task", "method", "seeds x episodes", "median", "IQM", "better than BC"]
+    assert table[0] == ["task", "method", "seeds x episodes", "median", "IQM", "learned", "better than BC"]
     assert [row[:2] for row in table[2:]] == [
         [task, method] for task in ("clean", "both", "all") for method in ("BC (q = 1)", "proposal")
     ]
     assert all(row[2] == "3 x 4" for row in table[2:])
-    assert table[3][5] == "1.00 (1.00 to 1.00)" and table[2][5] == "-"
+    assert table[3][6] == "1.00 (1.00 to 1.00)" and table[2][6] == "-"
+    assert [row[5] for row in table[2:]] == [f"{sum(values)}/{len(values)}" for values in learned_of(rows)]
     value, low, high = (float(x) for x in table[3][3].replace("(", "").replace(")", "").replace("to", "").split())
     assert low <= value <= high and 900 < value < 1100
     assert (tmp_path / "pictures" / "figure3_std0.2.png").stat().st_size > 1000
