@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import shutil
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -131,7 +132,10 @@ def save_plots(rows: Sequence[Mapping[str, Any]], output: Path, pictures: Path, 
 def report(
     rows: Sequence[Mapping[str, Any]], output: Path, pictures: Path, kind: str, *, steps: int, epoch: int
 ) -> str:
-    """Publishes the table and the pictures; returns the table's text."""
+    """Publishes the table, the pictures, and each method's video beside them; returns the table's text."""
+    pictures.mkdir(parents=True, exist_ok=True)
+    for video in sorted(output.glob("seed_*/*/rollout.gif")):
+        shutil.copyfile(video, pictures / f"{video.parent.name}.gif")
     return publish(
         summarise(rows, output), lambda: save_plots(rows, output, pictures, steps, epoch), output, pictures, kind
     )

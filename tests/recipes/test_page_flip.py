@@ -50,7 +50,7 @@ def test_one_command_gives_raw_results_table_and_pictures(tmp_path):
         assert (output / f"{name}.png").stat().st_size > 1000
     for method in METHODS:
         unit = output / "seed_0" / method
-        assert (unit / "rollout.gif").read_bytes()[:3] == b"GIF"
+        assert (output / f"{method}.gif").read_bytes()[:3] == b"GIF"
         errors = [line.split(",") for line in (unit / "scalars" / "eval" / "mse.csv").read_text().split()]
         assert [int(step) for step, _ in errors] == [4, 8] and all(float(value) > 0 for _, value in errors)
         with np.load(unit / "trials.npz") as file:
