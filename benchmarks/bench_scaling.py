@@ -105,7 +105,7 @@ def main() -> None:
     parser.add_argument("--workers", type=int, nargs="*", default=[1, 2])
     parser.add_argument("--environments", type=int, nargs="*", default=[1, 2, 4, 8])
     parser.add_argument("--steps", type=int, default=20)
-    parser.add_argument("--episodes", type=int, default=16)
+    parser.add_argument("--episodes", type=int, default=64, help="many: the start, which is taken off, varies")
     parser.add_argument("--threads", type=int, default=1, help="of the training; with 1, CPU time is measured")
     parser.add_argument("--output", type=Path, default=Path("outputs/bench_scaling.png"))
     parser.add_argument("--one", help=argparse.SUPPRESS)

@@ -58,10 +58,10 @@ def stacked(data: TensorDict, members: int, gamma_mix: float | str, compiled: bo
     return run
 
 
-def gemm_rate(members: int) -> float:
-    """FLOP a second of the batched product of the hidden layer."""
+def gemm_rate(members: int, clock: Callable[[], float]) -> float:
+    """FLOP a second of the batched product of the hidden layer, by the clock of the other measurements."""
     x, w = torch.randn(members, BATCH, HIDDEN), torch.randn(members, HIDDEN, HIDDEN)
-    seconds = [timed(lambda: [torch.bmm(x, w) for _ in range(10)]) / 10 for _ in range(15)]
+    seconds = [timed(lambda: [torch.bmm(x, w) for _ in range(10)], clock) / 10 for _ in range(15)]
     return 2 * members * BATCH * HIDDEN * HIDDEN / statistics.median(seconds)
 
 
@@ -99,7 +99,7 @@ def main() -> None:
             value = timed(lambda run=run, steps=steps: run(steps), clock) / (steps * members)
             if repeat:
                 seconds[name].append(value)
-    floor = FLOP / gemm_rate(args.members)
+    floor = FLOP / gemm_rate(args.members, clock)
     base = statistics.median(next(iter(seconds.values())))
     print(f"floor {1e3 * floor:.3f} ms: {FLOP / 1e6:.1f} MFLOP a member-step at {1e-9 * FLOP / floor:.0f} GFLOP/s")
     for name, values in seconds.items():
