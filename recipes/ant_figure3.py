@@ -22,8 +22,9 @@ from typing import Any
 
 import hydra
 import torch
-from ant_common import TRAINING, as_list, check_names, demonstrations, keep_settings
+from ant_common import TRAINING, check_names, demonstrations
 from ant_units import ReturnsTable, Unit, alone_in, key_of, plan
+from common import as_list, keep_settings, make_trainer
 from figure3_report import read_raw, report, save_raw
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
@@ -87,19 +88,8 @@ def train(unit: Unit, cfg: DictConfig) -> None:
     epoch = len(members[0]) // cfg.batch_size
     folder = unit.folder
     logger = make_logger(cfg.log, folder, "log", group=f"std_{unit.std:g}/{unit.task}", tags=[unit.task, folder.name])
-    trainer = instantiate(cfg.trainer, _partial_=True)(
-        loss=loss,
-        replay_buffer=buffer,
-        optimizer=instantiate(cfg.optimizer, batch_dims=1),
-        updater=instantiate(cfg.updater),
-        tuner=partial(instantiate(cfg.tuner), tuned=tuned) if any(tuned) else None,
-        logger=logger,
-        steps=cfg.epochs * epoch,
-        log_every=epoch,
-        checkpoint_dir=folder / "checkpoints",
-        checkpoint_every=cfg.checkpoint_every * epoch,
-        progress=False,  # the main process shows one bar for all of them
-    )
+    options = {"epoch": epoch, "tuned": tuned, "logger": logger, "folder": folder}
+    trainer = make_trainer(cfg, loss, buffer, batch_dims=1, **options)
     trainer.register_op("post_steps", tick)
     done = resume(trainer)
     tick(done // epoch)

@@ -20,8 +20,9 @@ from pathlib import Path
 
 import hydra
 import torch
-from ant_common import TRAINING, as_list, check_names, demonstrations, keep_settings
+from ant_common import TRAINING, check_names, demonstrations
 from ant_report import kinds_of, read_returns, report, save_returns
+from common import as_list, keep_settings, make_trainer
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 from safetensors.torch import load_file, save_file
@@ -79,19 +80,8 @@ def train(unit: Unit, cfg: DictConfig) -> None:
     logger = unit_logger(unit, cfg)
     logger.log_hparams({**OmegaConf.to_container(cfg, resolve=True), "task": task, "seed": seed, "method": method})
     epoch = len(data) // cfg.batch_size
-    trainer = instantiate(cfg.trainer, _partial_=True)(
-        loss=loss,
-        replay_buffer=make_replay_buffer(data, batch_size=cfg.batch_size, seed=seed),
-        optimizer=instantiate(cfg.optimizer),
-        updater=instantiate(cfg.updater),
-        tuner=instantiate(cfg.tuner) if tune else None,
-        logger=logger,
-        steps=cfg.epochs * epoch,
-        log_every=epoch,
-        checkpoint_dir=folder / "checkpoints",
-        checkpoint_every=cfg.checkpoint_every * epoch,
-        progress=False,  # the main process shows one bar for all of them
-    )
+    buffer = make_replay_buffer(data, batch_size=cfg.batch_size, seed=seed)
+    trainer = make_trainer(cfg, loss, buffer, epoch=epoch, tuned=tune, logger=logger, folder=folder)
     trainer.register_op("post_steps", tick)
     done = resume(trainer) if cfg.resume else 0
     tick(done // epoch)

@@ -21,8 +21,8 @@ from typing import Any
 import hydra
 import numpy as np
 import torch
-from ant_common import as_list, keep_settings
 from collect_flip import collect_flips
+from common import as_list, keep_settings, make_trainer
 from flip_report import faults_of, read_rows, report, save_rows
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
@@ -105,19 +105,8 @@ def train(unit: Unit, cfg: DictConfig) -> None:
     logger = unit_logger(unit, cfg)
     logger.log_hparams({**OmegaConf.to_container(cfg, resolve=True), "seed": seed, "method": method})
     epoch = len(data) // cfg.data.steps // cfg.num_slices
-    trainer = instantiate(cfg.trainer, _partial_=True)(
-        loss=loss,
-        replay_buffer=make_sequence_buffer(data, slice_len=cfg.slice_len, num_slices=cfg.num_slices, seed=seed),
-        optimizer=instantiate(cfg.optimizer),
-        updater=instantiate(cfg.updater),
-        tuner=instantiate(cfg.tuner) if tune else None,
-        logger=logger,
-        steps=cfg.epochs * epoch,
-        log_every=epoch,
-        checkpoint_dir=folder / "checkpoints",
-        checkpoint_every=cfg.checkpoint_every * epoch,
-        progress=False,  # the main process shows one bar for all of them
-    )
+    buffer = make_sequence_buffer(data, slice_len=cfg.slice_len, num_slices=cfg.num_slices, seed=seed)
+    trainer = make_trainer(cfg, loss, buffer, epoch=epoch, tuned=tune, logger=logger, folder=folder)
     measure = partial(errors, actor, held_out, cfg.data.action_unit)
     EvaluationHook(measure, cfg.validate_every * epoch).register(trainer)
     trainer.register_op("post_steps", tick)

@@ -212,7 +212,7 @@ def units(monkeypatch):
 
 
 def test_settings_that_changed_are_refused_and_new_options_are_not(units, tmp_path):
-    from ant_common import keep_settings
+    from common import keep_settings
 
     file = tmp_path / "settings.json"
     settings = {"loss": {"gamma_min": 0.1, "levels": [1, 2]}, "epochs": 3, "workers": 1}
