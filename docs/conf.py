@@ -16,6 +16,7 @@ extensions = [
     "myst_parser",
 ]
 myst_enable_extensions = ["dollarmath", "amsmath"]
+myst_heading_anchors = 3
 autodoc_typehints = "none"
 autodoc_default_options = {"members": True}
 napoleon_custom_sections = [("Keyword Args", "params_style")]
