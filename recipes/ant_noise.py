@@ -22,7 +22,7 @@ import hydra
 import torch
 from ant_common import TRAINING, check_names, demonstrations
 from ant_report import kinds_of, read_returns, report, save_returns
-from common import as_list, keep_settings, make_trainer
+from common import as_list, keep_method_settings, make_trainer
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 from safetensors.torch import load_file, save_file
@@ -59,11 +59,7 @@ def unit_logger(unit: Unit, cfg: DictConfig) -> LoggerGroup:
 
 def check_settings(units: list[Unit], cfg: DictConfig) -> None:
     """Keeps each training's settings in its folder; a resumed one must have the same."""
-    every = OmegaConf.to_container(cfg, resolve=True)
-    for unit in units:
-        method = every["methods"][unit[2]]
-        names = (*TRAINING, "evaluation", *method)
-        keep_settings(folder_of(unit, cfg) / "settings.json", every | method, names, "resume=false")
+    keep_method_settings(cfg, {folder_of(unit, cfg): unit[-1] for unit in units}, (*TRAINING, "evaluation"))
 
 
 def train(unit: Unit, cfg: DictConfig) -> None:

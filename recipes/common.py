@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from hydra.utils import instantiate
-from omegaconf import DictConfig, ListConfig
+from omegaconf import DictConfig, ListConfig, OmegaConf
 from torchrl.trainers import Trainer
 
 from torchrl_tsallis._io import atomic_path
@@ -91,3 +91,20 @@ def keep_settings(file: Path, settings: Mapping[str, Any], names: Sequence[str],
         raise SystemExit(f"{file} was made with other {', '.join(changed)}: {advice}")
     with atomic_path(file) as path:
         path.write_text(json.dumps(wanted, indent=1))
+
+
+def keep_method_settings(cfg: DictConfig, folders: Mapping[Path, str], names: Sequence[str]) -> None:
+    """Keeps the settings of trainings in their folders; a resumed one must have the same.
+
+    Args:
+        cfg: of the recipe.
+        folders: of the trainings, with the method of each.
+        names: of the settings that are kept along with the method's own.
+
+    Raises:
+        SystemExit: as :func:`keep_settings`.
+    """
+    every = OmegaConf.to_container(cfg, resolve=True)
+    for folder, name in folders.items():
+        method = every["methods"][name]
+        keep_settings(folder / "settings.json", every | method, (*names, *method), "resume=false")

@@ -22,7 +22,7 @@ import hydra
 import numpy as np
 import torch
 from collect_flip import collect_flips
-from common import as_list, keep_settings, make_trainer
+from common import as_list, keep_method_settings, make_trainer
 from flip_report import faults_of, read_rows, report, save_rows
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
@@ -72,11 +72,7 @@ def demonstrations(cfg: DictConfig, progress: bool = False) -> tuple[Any, Any]:
 
 def check_settings(units: list[Unit], cfg: DictConfig) -> None:
     """Keeps each training's settings in its folder; a resumed one must have the same."""
-    every = OmegaConf.to_container(cfg, resolve=True)
-    for unit in units:
-        method = every["methods"][unit[1]]
-        names = (*SETTINGS, *method)
-        keep_settings(folder_of(unit, cfg) / "settings.json", every | method, names, "resume=false")
+    keep_method_settings(cfg, {folder_of(unit, cfg): unit[-1] for unit in units}, SETTINGS)
 
 
 def errors(actor: Any, data: Any, unit: float) -> dict[str, float]:
