@@ -112,7 +112,7 @@ def evaluate(unit: Unit, cfg: DictConfig) -> None:
     counts = table.counts()
     for key in unit.keys:
         method, task, std, seed = key
-        first, start = counts.get(key, 0), f"{method}/{seed}/"
+        first, start = counts[key], f"{method}/{seed}/"
         if first < cfg.evaluation.episodes:
             own = {name.removeprefix(start): value for name, value in states.items() if name.startswith(start)}
             rows = evaluate_policies(

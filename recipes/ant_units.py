@@ -8,6 +8,7 @@ import io
 import json
 import os
 import shutil
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -59,12 +60,9 @@ class ReturnsTable:
         """The rows ``{method, task, std, seed, episode, return}``."""
         return parse(self.path.read_text(encoding="utf-8")) if self.path.exists() else []
 
-    def counts(self) -> dict[Key, int]:
+    def counts(self) -> Counter[Key]:
         """How many episodes there are of each policy: they are written in their order, so that the rest is missing."""
-        counts: dict[Key, int] = {}
-        for row in self.read():
-            counts[key_of(row)] = counts.get(key_of(row), 0) + 1
-        return counts
+        return Counter(map(key_of, self.read()))
 
     def append(self, rows: Sequence[Mapping[str, Any]]) -> None:
         """Adds rows, and returns once they are on the disk."""
@@ -133,7 +131,7 @@ def plan(wanted: Sequence[Key], table: ReturnsTable, output: Path, episodes: int
         The units with a policy that misses episodes. No policy is in two units.
     """
     counts = table.counts()
-    missing = [key for key in wanted if counts.get(key, 0) < episodes]
+    missing = [key for key in wanted if counts[key] < episodes]
     known = [Unit.load(file) for file in sorted(output.glob("std_*/*/*/unit.json"))]
     for unit in [unit for unit in known if not unit.begun]:
         shutil.rmtree(unit.folder)  # to be planned anew, by what is asked for now

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import gzip
 import io
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from ant_report import as_markdown, by_method
-from ant_units import as_csv, parse
+from ant_units import as_csv, key_of, parse
 
 from torchrl_tsallis._io import atomic_path
 from torchrl_tsallis.evaluation import bootstrap_interval, improvement_interval, iqm, median, returns_grid
@@ -49,11 +50,8 @@ def label_of(method: str) -> str:
 def scores_of(rows: Sequence[Mapping[str, Any]]) -> Scores:
     """Returns by task and method, ``[S, E]``; of seeds that are being evaluated, only complete ones."""
     episodes = 1 + max(row["episode"] for row in rows)
-    counts: dict[tuple[str, str, int], int] = {}
-    for row in rows:
-        key = (row["task"], row["method"], row["seed"])
-        counts[key] = counts.get(key, 0) + 1
-    whole = [row for row in rows if counts[row["task"], row["method"], row["seed"]] == episodes]
+    counts = Counter(map(key_of, rows))
+    whole = [row for row in rows if counts[key_of(row)] == episodes]
     return {task: by_method(whole, task) for task in dict.fromkeys(row["task"] for row in whole)}
 
 

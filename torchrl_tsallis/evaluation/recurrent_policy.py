@@ -7,11 +7,7 @@ from typing import Any
 
 import numpy as np
 
-
-def _array(value: Any) -> np.ndarray:
-    """Copies a tensor or array to float32."""
-    value = value.detach().cpu().float().numpy() if hasattr(value, "detach") else value
-    return np.array(value, dtype=np.float32)
+from torchrl_tsallis.evaluation.mean_policy import _array
 
 
 class RecurrentMeanPolicy:
