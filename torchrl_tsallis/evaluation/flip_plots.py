@@ -10,24 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from torchrl_tsallis._io import atomic_path
-from torchrl_tsallis.evaluation.plots import PALETTE, _not_empty
+from torchrl_tsallis.evaluation.plots import PALETTE, _canvas, _not_empty, _save
 from torchrl_tsallis.evaluation.statistics import _checked, bootstrap_interval
-
-
-def _figure(width: float, height: float) -> Any:
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(width, height), dpi=150, layout="constrained")
-    FigureCanvasAgg(figure)
-    return figure
-
-
-def _save(figure: Any, path: str | os.PathLike[str]) -> Path:
-    with atomic_path(path) as temporary:
-        figure.savefig(temporary, format="png")
-    return Path(path)
 
 
 def _draw_bands(axes: Any, time: np.ndarray, bands: Mapping[str, np.ndarray]) -> None:
@@ -90,7 +74,7 @@ def force_over_time(
         if band.shape != (len(force),):
             raise ValueError(f"faults[{name!r}] has shape {band.shape}, needed is ({len(force)},)")
 
-    figure = _figure(7.2, 4.6)
+    figure = _canvas(7.2, 4.6)
     upper, lower = figure.subplots(2, sharex=True)
     time = dt * np.arange(len(force))
     for i, axis in enumerate("xyz"):
@@ -135,7 +119,7 @@ def error_curves(
         'mse.png'
     """
     _not_empty(errors)
-    figure = _figure(6.0, 3.6)
+    figure = _canvas(6.0, 3.6)
     axes = figure.subplots()
     seeds = 0
     for colour, (name, (epochs, values)) in zip(PALETTE, errors.items(), strict=False):
@@ -187,7 +171,7 @@ def flip_trajectories(
         'paths.png'
     """
     _not_empty(trials)
-    figure = _figure(3.0 * len(trials) + 0.6, 3.2)
+    figure = _canvas(3.0 * len(trials) + 0.6, 3.2)
     all_axes = figure.subplots(1, len(trials), sharex=True, sharey=True, squeeze=False)[0]
     for axes, colour, (name, trial) in zip(all_axes, PALETTE, trials.items(), strict=False):
         x, force = (np.asarray(part, dtype=float) for part in trial)
@@ -242,7 +226,7 @@ def ratings_over_time(
     for name, value in [*curves.items(), *bands.items()]:
         if value.shape != (length,):
             raise ValueError(f"{name!r} has shape {value.shape}, needed is ({length},)")
-    figure = _figure(7.2, 3.2)
+    figure = _canvas(7.2, 3.2)
     axes = figure.subplots()
     time = dt * np.arange(length)
     for colour, (name, curve) in zip(PALETTE, curves.items(), strict=False):

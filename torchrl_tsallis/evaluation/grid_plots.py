@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from torchrl_tsallis._io import atomic_path
-from torchrl_tsallis.evaluation.plots import PALETTE
+from torchrl_tsallis.evaluation.plots import PALETTE, _canvas
 from torchrl_tsallis.evaluation.statistics import _checked, bootstrap_interval, iqm, median
 
 
@@ -38,7 +38,6 @@ def returns_grid(
         'figure3.svg'
     """
     import matplotlib
-    from matplotlib.figure import Figure
 
     targets = [Path(path) for path in paths]
     for path in targets:
@@ -50,7 +49,7 @@ def returns_grid(
     columns = min(2, len(panels))
     rows = -(-len(panels) // columns)
     size = (columns * max(3.0, 0.45 * len(methods) + 1.0), 2.6 * rows + 0.9)
-    figure = Figure(figsize=size, dpi=150, layout="constrained")
+    figure = _canvas(*size)
     grid = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
     for axes in grid.flat[len(panels) :]:
         axes.set_visible(False)

@@ -18,19 +18,31 @@ from torchrl_tsallis.evaluation.statistics import _checked, bootstrap_interval
 PALETTE = ("#0072B2", "#E69F00", "#009E73", "#D55E00", "#CC79A7", "#56B4E9", "#8C8C8C", "#000000")
 
 
-@contextmanager
-def _figure(path: str | os.PathLike[str], width: float, height: float = 3.4) -> Iterator[Any]:
-    """Yields axes that are saved atomically afterwards, without pyplot's global state."""
+def _canvas(width: float, height: float) -> Any:
+    """A figure without pyplot's global state."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(width, height), dpi=150, layout="constrained")
     FigureCanvasAgg(figure)
+    return figure
+
+
+def _save(figure: Any, path: str | os.PathLike[str]) -> Path:
+    """Writes a figure as PNG, atomically."""
+    with atomic_path(path) as temporary:
+        figure.savefig(temporary, format="png")
+    return Path(path)
+
+
+@contextmanager
+def _figure(path: str | os.PathLike[str], width: float, height: float = 3.4) -> Iterator[Any]:
+    """Yields axes that are saved afterwards."""
+    figure = _canvas(width, height)
     axes = figure.subplots()
     axes.spines[["top", "right"]].set_visible(False)
     yield axes
-    with atomic_path(path) as temporary:
-        figure.savefig(temporary, format="png")
+    _save(figure, path)
 
 
 def _not_empty(data: Mapping[str, Any]) -> None:
