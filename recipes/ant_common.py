@@ -1,4 +1,4 @@
-"""What recipes/ant_noise.py and recipes/ant_figure3.py share."""
+"""What the recipes on the Ant share: its data."""
 
 from __future__ import annotations
 
@@ -8,22 +8,28 @@ from collect_ant import collect_dataset
 from common import as_list
 from omegaconf import DictConfig
 
-from torchrl_tsallis.data import TASKS
+from torchrl_tsallis.data import TASKS, make_task, replace_pairs
 
 #: The entries of the configuration that decide about a policy.
-TRAINING = ("policy", "loss", "tuner", "optimizer", "updater", "epochs", "batch_size", "data")
+TRAINING = ("policy", "ratings", "tuners", "optimizer", "updater", "epochs", "batch_size", "data")
+#: Share of the pairs that others replace in the tasks named so.
+CONFLICTS = {"conflict_20": 0.2, "conflict_40": 0.4}
 
 
-def check_names(cfg: DictConfig) -> None:
-    """Refuses tasks and methods that do not exist."""
-    for name, allowed in (("task", TASKS), ("method", cfg.methods)):
-        unknown = [value for value in as_list(cfg[name]) if value not in allowed]
+def check_names(cfg: DictConfig, asked: DictConfig | None = None) -> None:
+    """Refuses tasks and methods that do not exist; those of ``asked``, or of the configuration itself."""
+    for name, allowed in (("task", (*TASKS, *CONFLICTS)), ("method", cfg.methods)):
+        unknown = [value for value in as_list((asked or cfg)[name]) if value not in allowed]
         if unknown:
             raise SystemExit(f"no {name} {unknown[0]!r}: choose one or a list of {', '.join(allowed)}")
 
 
 def demonstrations(cfg: DictConfig, progress: bool = False) -> tuple[Any, Any]:
-    """The recorded demonstrations, from the cache or made now."""
+    """The recorded demonstrations of the experts and the amateur, from the cache or made now."""
+    return _recorded(cfg, tuple(cfg.data.policies[:-1]), progress)
+
+
+def _recorded(cfg: DictConfig, experts: tuple[str, ...], progress: bool) -> tuple[Any, Any]:
     data = cfg.data
     return collect_dataset(
         data.cache,
@@ -31,8 +37,17 @@ def demonstrations(cfg: DictConfig, progress: bool = False) -> tuple[Any, Any]:
         seed=data.seed,
         length=data.length,
         clip=data.clip,
-        experts=tuple(data.policies[:-1]),
+        experts=experts,
         amateur=data.policies[-1],
         workers=cfg.workers,
         progress=progress,
     )
+
+
+def task_data(task: str, cfg: DictConfig, seed: int) -> Any:
+    """The demonstrations of a task, ``[N]``: one of the paper's four, or a conflict with learners pair by pair."""
+    experts, amateur = demonstrations(cfg)
+    if task not in CONFLICTS:
+        return make_task(task, experts, amateur, seed=seed, **cfg.data.noise)
+    others, _ = _recorded(cfg, tuple(cfg.data.learners), False)
+    return replace_pairs(experts, others, share=CONFLICTS[task], seed=seed)

@@ -1,6 +1,6 @@
 """Imitation of noisy PyBullet Ant demonstrations (section V): plain BC against this method.
 
-The default run trains BC, q-BC and the proposal on the task with both noises, and evaluates them::
+The default run trains BC, q-BC, the proposal and the peak rating on the task with both noises, and evaluates them::
 
     python recipes/ant_noise.py
 
@@ -20,9 +20,9 @@ from pathlib import Path
 
 import hydra
 import torch
-from ant_common import TRAINING, check_names, demonstrations
+from ant_common import TRAINING, check_names, demonstrations, task_data
 from ant_report import kinds_of, read_returns, report, save_returns
-from common import as_list, keep_method_settings, make_trainer
+from common import as_list, keep_method_settings, make_rating, make_trainer
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 from safetensors.torch import load_file, save_file
@@ -31,7 +31,7 @@ from torchrl._utils import logger as torchrl_logger
 import torchrl_tsallis.trainers.configs  # noqa: F401 (registers the groups that the YAML file names)
 from torchrl_tsallis._io import atomic_path
 from torchrl_tsallis._pool import run_jobs, tick
-from torchrl_tsallis.data import make_replay_buffer, make_task, validate_demonstrations
+from torchrl_tsallis.data import make_replay_buffer, validate_demonstrations
 from torchrl_tsallis.evaluation import MeanPolicy, evaluate_policies, median, record_rollout
 from torchrl_tsallis.trainers import LoggerGroup, make_logger, resume
 
@@ -68,16 +68,15 @@ def train(unit: Unit, cfg: DictConfig) -> None:
     task, seed, method = unit
     folder = folder_of(unit, cfg)
     torch.manual_seed(seed)
-    settings = dict(cfg.methods[method])
-    tune = settings.pop("tune_q")
-    data = make_task(task, *demonstrations(cfg), seed=seed, **cfg.data.noise)
+    data = task_data(task, cfg, seed)
     actor = instantiate(cfg.policy, obs_dim=data["observation"].shape[1], action_dim=data["action"].shape[1])
-    loss = instantiate(cfg.loss, _partial_=True)(actor_network=actor, **settings)
+    rating, tuner = make_rating(cfg, cfg.methods[method])
+    loss = instantiate(cfg.loss, _partial_=True)(actor_network=actor, rating=rating)
     logger = unit_logger(unit, cfg)
     logger.log_hparams({**OmegaConf.to_container(cfg, resolve=True), "task": task, "seed": seed, "method": method})
     epoch = len(data) // cfg.batch_size
     buffer = make_replay_buffer(data, batch_size=cfg.batch_size, seed=seed)
-    trainer = make_trainer(cfg, loss, buffer, epoch=epoch, tuned=tune, logger=logger, folder=folder)
+    trainer = make_trainer(cfg, loss, buffer, epoch=epoch, tuner=tuner, logger=logger, folder=folder)
     trainer.register_op("post_steps", tick)
     done = resume(trainer) if cfg.resume else 0
     tick(done // epoch)

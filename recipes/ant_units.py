@@ -1,4 +1,4 @@
-"""The bookkeeping of recipes/ant_figure3.py: the table of returns, and the units of work that fill it."""
+"""The bookkeeping of the sweeps on the Ant: the table of returns, and the units of work that fill it."""
 
 from __future__ import annotations
 
@@ -9,40 +9,62 @@ import json
 import os
 import shutil
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from torchrl_tsallis._io import atomic_path
 
-COLUMNS = ("method", "task", "std", "seed", "episode", "return")
-Key = tuple[str, str, float, int]  # method, task, std, seed: one policy
+COLUMNS = ("method", "trio", "task", "std", "scale", "seed", "episode", "return")
+FORMATS = {"std": float, "scale": float, "seed": int, "episode": int, "return": float}
+
+
+class Key(NamedTuple):
+    """One policy.
+
+    Attributes:
+        method: name of it in the configuration.
+        task: of the corruptions.
+        std: of the noise on the experts' commands.
+        seed: of the corruptions, the network and the order of the samples.
+        trio: who demonstrates, a name in the configuration.
+        scale: factor of the actions, whose unit it changes.
+    """
+
+    method: str
+    task: str
+    std: float
+    seed: int
+    trio: str = "own"
+    scale: float = 1.0
 
 
 def parse(text: str) -> list[dict[str, Any]]:
     """Rows of a table, each episode once: the first of equal ones counts, and a last line without its end does not."""
     complete = text[: text.rfind("\n") + 1]
     rows: dict[tuple[str, ...], dict[str, Any]] = {}
-    for row in csv.DictReader(io.StringIO(complete)):
-        values = {"std": float(row["std"]), "seed": int(row["seed"]), "return": float(row["return"])}
-        rows.setdefault(tuple(row[name] for name in COLUMNS[:-1]), {**row, **values, "episode": int(row["episode"])})
+    for read in csv.DictReader(io.StringIO(complete)):
+        row = {**Key._field_defaults, **read}  # a table may have no columns for what does not vary in it
+        row |= {name: kind(row[name]) for name, kind in FORMATS.items()}
+        rows.setdefault(tuple(row[name] for name in COLUMNS[:-1]), row)
     return list(rows.values())
 
 
 def key_of(row: Mapping[str, Any]) -> Key:
     """The policy that a row is of."""
-    return row["method"], row["task"], row["std"], row["seed"]
+    return Key(*(row[name] for name in Key._fields))
 
 
-def as_csv(rows: Sequence[Mapping[str, Any]], header: bool = True) -> str:
+def as_csv(rows: Sequence[Mapping[str, Any]], header: bool = True, columns: Sequence[str] = COLUMNS) -> str:
     """Rows as CSV, returns with three decimals."""
     text = io.StringIO()
-    writer = csv.DictWriter(text, COLUMNS, extrasaction="ignore", lineterminator="\n")
+    writer = csv.DictWriter(text, columns, extrasaction="ignore", lineterminator="\n")
     if header:
         writer.writeheader()
-    writer.writerows({**row, "std": f"{row['std']:g}", "return": f"{row['return']:.3f}"} for row in rows)
+    digits = {"std": "g", "scale": "g", "return": ".3f"}
+    writer.writerows({**row, **{name: format(row[name], kind) for name, kind in digits.items()}} for row in rows)
     return text.getvalue()
 
 
@@ -57,7 +79,7 @@ class ReturnsTable:
         self.path = Path(path)
 
     def read(self) -> list[dict[str, Any]]:
-        """The rows ``{method, task, std, seed, episode, return}``."""
+        """The rows, by the columns' names."""
         return parse(self.path.read_text(encoding="utf-8")) if self.path.exists() else []
 
     def counts(self) -> Counter[Key]:
@@ -79,24 +101,25 @@ class ReturnsTable:
 
 @dataclass(frozen=True)
 class Unit:
-    """Policies that are trained as one program and then evaluated: all methods of some seeds of a task.
+    """Policies that are trained as one program and then evaluated: methods of one kind, of some seeds of a condition.
 
     Attributes:
         folder: of its checkpoints, policies and logs.
-        task: one of the paper's four.
-        std: of the noise on the experts' commands.
-        members: method and seed of each policy.
+        keys: its policies, alike but for method and seed.
     """
 
     folder: Path
-    task: str
-    std: float
-    members: tuple[tuple[str, int], ...]
+    keys: tuple[Key, ...]
 
     @property
-    def keys(self) -> list[Key]:
-        """Its policies, by the table's columns."""
-        return [(method, self.task, self.std, seed) for method, seed in self.members]
+    def condition(self) -> Key:
+        """What its policies have in common: task, std, trio and scale."""
+        return self.keys[0]
+
+    @property
+    def members(self) -> list[tuple[str, int]]:
+        """Method and seed of each policy."""
+        return [(key.method, key.seed) for key in self.keys]
 
     @property
     def begun(self) -> bool:
@@ -105,19 +128,23 @@ class Unit:
 
     def save(self) -> None:
         """Writes down which policies are its own."""
-        content = {"task": self.task, "std": self.std, "members": self.members}
         with atomic_path(self.folder / "unit.json") as path:
-            path.write_text(json.dumps(content))
+            path.write_text(json.dumps([key._asdict() for key in self.keys]))
 
     @classmethod
     def load(cls, file: Path) -> Unit:
         """Reads what :meth:`save` wrote."""
-        content = json.loads(file.read_text())
-        members = tuple((method, seed) for method, seed in content["members"])
-        return cls(file.parent, content["task"], content["std"], members)
+        return cls(file.parent, tuple(Key(**key) for key in json.loads(file.read_text())))
 
 
-def plan(wanted: Sequence[Key], table: ReturnsTable, output: Path, episodes: int, block: int) -> list[Unit]:
+def plan(
+    wanted: Sequence[Key],
+    table: ReturnsTable,
+    output: Path,
+    episodes: int,
+    block: int,
+    kind_of: Callable[[str], str] = lambda method: "",
+) -> list[Unit]:
     """The units of work that are left: those that were begun, and new ones for the policies that are in none.
 
     Args:
@@ -126,29 +153,33 @@ def plan(wanted: Sequence[Key], table: ReturnsTable, output: Path, episodes: int
         output: folder of the units.
         episodes: that each policy has to have.
         block: seeds of a new unit.
+        kind_of: of a method; methods of different kinds are not trained as one program. Default: all are of one kind.
 
     Returns:
         The units with a policy that misses episodes. No policy is in two units.
     """
     counts = table.counts()
     missing = [key for key in wanted if counts[key] < episodes]
-    known = [Unit.load(file) for file in sorted(output.glob("std_*/*/*/unit.json"))]
+    known = [Unit.load(file) for file in sorted(output.glob("*/std_*/*/*/unit.json"))]
     for unit in [unit for unit in known if not unit.begun]:
         shutil.rmtree(unit.folder)  # to be planned anew, by what is asked for now
         known.remove(unit)
     units = [unit for unit in known if set(unit.keys) & set(missing)]
     taken = {key for unit in known for key in unit.keys}
-    groups: dict[tuple[str, float], dict[int, list[str]]] = {}
-    for method, task, std, seed in missing:
-        if (method, task, std, seed) not in taken:
-            groups.setdefault((task, std), {}).setdefault(seed, []).append(method)
-    for (task, std), methods in groups.items():
-        seeds = sorted(methods)
+    groups: dict[tuple[Key, str], dict[int, list[Key]]] = {}
+    for key in missing:
+        if key not in taken:
+            group = (key._replace(method="", seed=0), kind_of(key.method))
+            groups.setdefault(group, {}).setdefault(key.seed, []).append(key)
+    for (condition, _), policies in groups.items():
+        place = f"{condition.trio}/std_{condition.std:g}"
+        place += f"/{condition.task}" + f"_scale_{condition.scale:g}" * (condition.scale != 1)
+        seeds = sorted(policies)
         for part in (seeds[i : i + block] for i in range(0, len(seeds), block)):
             name, number = f"seeds_{part[0]:02d}-{part[-1]:02d}", 1
-            while (folder := output / f"std_{std:g}" / task / f"{name}{f'_{number}' * (number > 1)}").exists():
+            while (folder := output / place / f"{name}{f'_{number}' * (number > 1)}").exists():
                 number += 1
-            unit = Unit(folder, task, std, tuple((method, seed) for seed in part for method in methods[seed]))
+            unit = Unit(folder, tuple(key for seed in part for key in policies[seed]))
             unit.save()
             units.append(unit)
     return units

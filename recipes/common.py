@@ -20,13 +20,40 @@ def as_list(value: Any) -> list[Any]:
     return list(value) if isinstance(value, (list, ListConfig)) else [value]
 
 
+def make_rating(cfg: DictConfig, method: DictConfig | Sequence[DictConfig]) -> tuple[Any, Any]:
+    """The rating of a method, and what tunes it.
+
+    Args:
+        cfg: of the recipe; ``ratings`` and ``tuners`` hold the kinds that methods are settings of.
+        method: ``rating``, the kind; ``tuned``; and the rating's own settings. Of stacked members a sequence of methods
+            of one kind.
+
+    Returns:
+        The rating, and its tuner as a partial that waits for the loss; None where nothing is tuned.
+
+    Raises:
+        ValueError: if the methods are of several kinds.
+    """
+    stacked = not isinstance(method, DictConfig)
+    settings = [dict(one) for one in (method if stacked else [method])]
+    kinds = {one.pop("rating") for one in settings}
+    if len(kinds) > 1:
+        raise ValueError(f"methods of the kinds {sorted(kinds)} cannot be trained as one program")
+    kind, tuned = kinds.pop(), [bool(one.pop("tuned")) for one in settings]
+    values = {name: [one[name] for one in settings] if stacked else settings[0][name] for name in settings[0]}
+    tuner = instantiate(cfg.tuners[kind]) if any(tuned) else None
+    if tuner is not None and stacked:
+        tuner = partial(tuner, tuned=tuned)
+    return instantiate(cfg.ratings[kind], **values), tuner
+
+
 def make_trainer(
     cfg: DictConfig,
     loss: Any,
     buffer: Any,
     *,
     epoch: int,
-    tuned: Any,
+    tuner: Any,
     logger: Any,
     folder: Path,
     **optimizer: Any,
@@ -38,7 +65,7 @@ def make_trainer(
         loss: its loss.
         buffer: replay buffer of its data.
         epoch: steps an epoch, after which it logs.
-        tuned: whether q is tuned; of stacked members a list.
+        tuner: of its rating, as :func:`make_rating` gives it.
         logger: its loggers.
         folder: its checkpoints are in a folder there.
         optimizer: further arguments of the optimizer.
@@ -46,15 +73,12 @@ def make_trainer(
     Returns:
         The trainer, which has not begun.
     """
-    tuner = instantiate(cfg.tuner)
-    if isinstance(tuned, list):
-        tuner, tuned = partial(tuner, tuned=tuned), any(tuned)
     return instantiate(cfg.trainer, _partial_=True)(
         loss=loss,
         replay_buffer=buffer,
         optimizer=instantiate(cfg.optimizer, **optimizer),
         updater=instantiate(cfg.updater),
-        tuner=tuner if tuned else None,
+        tuner=tuner,
         logger=logger,
         steps=cfg.epochs * epoch,
         log_every=epoch,

@@ -22,6 +22,8 @@ LABELS = {
     "adaptive_gamma": "adaptive gamma, q = 0.8",
     "proposal": "proposal",
 }
+#: Columns of the published file.
+FIGURE3 = ("method", "task", "std", "seed", "episode", "return")
 Scores = dict[str, dict[str, np.ndarray]]  # task -> method -> [S, E]
 
 
@@ -29,7 +31,7 @@ def save_raw(path: str | Path, rows: Sequence[Mapping[str, Any]]) -> None:
     """Writes raw returns as gzipped CSV, atomically; equal rows give equal files."""
     text = io.BytesIO()
     with gzip.GzipFile(fileobj=text, mode="wb", filename="", mtime=0) as file:
-        file.write(as_csv(rows).encode())
+        file.write(as_csv(rows, columns=FIGURE3).encode())
     with atomic_path(path) as temporary:
         temporary.write_bytes(text.getvalue())
 

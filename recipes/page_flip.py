@@ -22,7 +22,7 @@ import hydra
 import numpy as np
 import torch
 from collect_flip import collect_flips
-from common import as_list, keep_method_settings, make_trainer
+from common import as_list, keep_method_settings, make_rating, make_trainer
 from flip_report import faults_of, read_rows, report, save_rows
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
@@ -40,7 +40,7 @@ from torchrl_tsallis.trainers import EvaluationHook, LoggerGroup, make_logger, r
 
 Unit = tuple[int, str]  # seed, method: one training
 #: The entries of the configuration that decide about a policy and its trials.
-SETTINGS = ("policy", "loss", "tuner", "optimizer", "updater", "data", "trials", "epochs", "slice_len", "num_slices")
+SETTINGS = ("policy", "loss", "ratings", "tuners", "optimizer", "updater", "data", "trials", "epochs", "slice_len", "num_slices")
 
 
 def units_of(cfg: DictConfig) -> list[Unit]:
@@ -91,18 +91,17 @@ def train(unit: Unit, cfg: DictConfig) -> None:
     seed, method = unit
     folder = folder_of(unit, cfg)
     torch.manual_seed(seed)
-    settings = dict(cfg.methods[method])
-    tune = settings.pop("tune_q")
     training, validation = demonstrations(cfg)
     scaling = Scaling.fit(training, action_unit=cfg.data.action_unit)
     data, held_out = scaling(training), scaling(validation).reshape(-1, cfg.data.steps)
     actor = instantiate(cfg.policy, obs_dim=data["observation"].shape[1], action_dim=data["action"].shape[1])
-    loss = instantiate(cfg.loss, _partial_=True)(actor_network=actor, **settings)
+    rating, tuner = make_rating(cfg, cfg.methods[method])
+    loss = instantiate(cfg.loss, _partial_=True)(actor_network=actor, rating=rating)
     logger = unit_logger(unit, cfg)
     logger.log_hparams({**OmegaConf.to_container(cfg, resolve=True), "seed": seed, "method": method})
     epoch = len(data) // cfg.data.steps // cfg.num_slices
     buffer = make_sequence_buffer(data, slice_len=cfg.slice_len, num_slices=cfg.num_slices, seed=seed)
-    trainer = make_trainer(cfg, loss, buffer, epoch=epoch, tuned=tune, logger=logger, folder=folder)
+    trainer = make_trainer(cfg, loss, buffer, epoch=epoch, tuner=tuner, logger=logger, folder=folder)
     measure = partial(errors, actor, held_out, cfg.data.action_unit)
     EvaluationHook(measure, cfg.validate_every * epoch).register(trainer)
     trainer.register_op("post_steps", tick)

@@ -4,7 +4,18 @@ from __future__ import annotations
 
 from torchrl_tsallis.objectives import CATSoftUpdate, PredictiveBCLoss, TsallisBCLoss
 from torchrl_tsallis.optim import AdaTerm
-from torchrl_tsallis.trainers import QTuner
+from torchrl_tsallis.ratings import PeakRating, QTuner, Rating, ScoreTuner, TsallisRating
 from torchrl_tsallis.version import __version__
 
-__all__ = ["AdaTerm", "CATSoftUpdate", "PredictiveBCLoss", "QTuner", "TsallisBCLoss", "__version__"]
+__all__ = [
+    "AdaTerm",
+    "CATSoftUpdate",
+    "PeakRating",
+    "PredictiveBCLoss",
+    "QTuner",
+    "Rating",
+    "ScoreTuner",
+    "TsallisBCLoss",
+    "TsallisRating",
+    "__version__",
+]

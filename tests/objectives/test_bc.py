@@ -20,9 +20,9 @@ from torchrl.modules import (
 from torchrl.objectives import SoftUpdate
 
 from torchrl_tsallis import TsallisBCLoss
-from torchrl_tsallis.functional import log_mixture, rating
+from torchrl_tsallis.ratings.tsallis.equations import log_mixture, rating
 from torchrl_tsallis.modules import make_policy
-from torchrl_tsallis.objectives import Reference, ReferenceDensity
+from torchrl_tsallis.ratings import TsallisRating
 
 
 def batch(*shape: int, dtype: torch.dtype = torch.float32) -> TensorDict:
@@ -114,7 +114,8 @@ def test_reduction_and_mask():
     masked = data.clone().set(("collector", "mask"), mask)
     loss, flat = make_loss(), data[mask]
     torch.testing.assert_close(loss(masked), loss(flat))
-    torch.testing.assert_close(loss.last_log_prob, log_probs(loss, flat).detach())
+    evidence, valid = loss(masked) and loss.last_evidence
+    torch.testing.assert_close(evidence[valid.mask], log_probs(loss, flat).detach())
     torch.testing.assert_close(grads(loss, masked), grads(loss, flat))
     summed = make_loss(reduction="sum")(masked)["loss_tsallis_bc"]
     torch.testing.assert_close(summed, loss(masked)["loss_tsallis_bc"] * mask.sum())
@@ -260,12 +261,12 @@ def test_state_dict_round_trip():
 
 
 def test_an_exchanged_reference_rates_against_the_peak():
-    class Peak(ReferenceDensity):
-        def forward(self, dist, target_log_prob, moment):
-            assert target_log_prob is None
-            return Reference(dist.log_prob(dist.mean), torch.zeros_like(moment))
+    class Peak(TsallisRating):
+        def log_reference(self, evidence, gamma):
+            assert evidence.target_log_prob is None
+            return evidence.dist.log_prob(evidence.dist.mean)
 
-    loss = make_loss(reference=Peak())
+    loss = make_loss(rating=Peak(q=0.8, gamma_mix=0.0))
     data = batch(4)
     with loss.actor_network_params.to_module(loss.actor_network):
         dist = loss.actor_network.get_dist(data.copy())
@@ -285,7 +286,7 @@ def test_errors_name_the_key_the_shape_and_the_fix():
     with pytest.raises(ValueError, match="empty"):
         loss(batch(0))
     with pytest.raises(RuntimeError, match="no batch"):
-        _ = make_loss(gamma_mix=0.0).last_log_prob
+        _ = make_loss(gamma_mix=0.0).last_evidence
 
 
 @pytest.mark.parametrize(

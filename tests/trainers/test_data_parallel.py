@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from torchrl_tsallis.objectives.distributed import num_processes
+from torchrl_tsallis.ratings.distributed import num_processes
 
 SCRIPT = Path(__file__).parent / "data_parallel_small.py"
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from torchrl_tsallis.data.corruptions import TASKS, add_action_noise, make_task, replace_with_amateur
+from torchrl_tsallis.data.corruptions import TASKS, add_action_noise, make_task, replace_pairs, replace_with_amateur
 from torchrl_tsallis.data.demonstrations import (
     load_demonstrations,
     record_trajectory,
@@ -31,6 +31,7 @@ __all__ = [
     "make_task",
     "record_flips",
     "record_trajectory",
+    "replace_pairs",
     "replace_with_amateur",
     "replay_forces",
     "save_demonstrations",

@@ -145,3 +145,42 @@ def make_task(
     if artificial:
         out = add_action_noise(out, probability=probability, mean=mean, scale=scale, seed=seed)
     return out
+
+
+def replace_pairs(
+    experts: TensorDictBase, others: TensorDictBase, *, share: float, seed: int = 0
+) -> TensorDict:
+    """Replaces randomly chosen pairs, one by one, by pairs of other demonstrators: samples that contradict each other.
+
+    Args:
+        experts: demonstrations ``[N]``; not changed.
+        others: of whoever is worse, ``[M]``; a pair of theirs may be drawn more than once.
+        share: chance of a pair to be replaced, in [0, 1].
+        seed: of the choice.
+
+    Returns:
+        A copy in which ``("info", "is_amateur")`` is set where a pair was replaced. It is a set of pairs: an episode
+        holds observations of several now.
+
+    Raises:
+        ValueError: if the share is not in [0, 1].
+
+    Examples:
+        >>> def rows(value):
+        ...     info = TensorDict({"is_amateur": torch.zeros(8, dtype=torch.bool)}, [8])
+        ...     return TensorDict({"action": torch.full((8, 1), value), "info": info}, [8])
+        >>> mixed = replace_pairs(rows(0.0), rows(1.0), share=0.5, seed=1)
+        >>> torch.equal(mixed["action"][:, 0].bool(), mixed["info", "is_amateur"])
+        True
+    """
+    if not 0 <= share <= 1:
+        raise ValueError(f"share must be in [0, 1], got {share}")
+    generator = torch.Generator().manual_seed(seed)
+    hit = torch.rand(experts.shape, generator=generator) < share
+    drawn = torch.randint(len(others), (int(hit.sum()),), generator=generator)
+    out = experts.clone()
+    for key in out.keys():
+        if key != "info":
+            out[key][hit] = others[key][drawn]
+    out["info", "is_amateur"][hit] = True
+    return out

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from typing import Any
 
 import torch
-from tensordict import TensorDictBase, is_tensor_collection
+from tensordict import TensorDictBase, TensorDictParams, is_tensor_collection
 from tensordict.nn import (
     CompositeDistribution,
     ProbabilisticTensorDictModule,
@@ -15,7 +17,10 @@ from tensordict.nn import (
 )
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
-from torch.distributions import Distribution
+from torch.distributions import Distribution, Independent, Normal
+
+#: Standardised distances beyond this one are taken for infinite; their fourth power still fits in float32.
+_FAR = 1e9
 
 
 def _network_and_head(
@@ -69,10 +74,34 @@ def get_dist(actor: ProbabilisticTensorDictSequential, inputs: TensorDictBase) -
         torch.Size([5])
     """
     parts = _network_and_head(actor)
-    if parts is None:
-        return actor.get_dist(inputs.copy())
-    network, head = parts
-    return head.get_dist(_call(network, [inputs.get(key) for key in network.in_keys]))
+    with _named_inputs(actor, inputs):
+        if parts is None:
+            return actor.get_dist(inputs.copy())
+        network, head = parts
+        return head.get_dist(_call(network, [inputs.get(key) for key in network.in_keys]))
+
+
+@contextmanager
+def _named_inputs(actor: nn.Module, inputs: TensorDictBase) -> Iterator[None]:
+    """Says what a network was given that it could not take: torch only speaks of matrices.
+
+    Raises:
+        TypeError: if an input is of another type than the actor's parameters.
+        ValueError: for anything else, which is mostly a wrong size.
+    """
+    try:
+        yield
+    except (RuntimeError, IndexError) as error:
+        if isinstance(error, NotImplementedError) or torch.compiler.is_compiling():
+            raise
+        wanted = {p.dtype for p in actor.parameters() if p.is_floating_point()}
+        given = {key: inputs.get(key) for key in actor.in_keys if isinstance(inputs.get(key, None), Tensor)}
+        listed = ", ".join(f"{key!r} {list(x.shape)} {x.dtype}" for key, x in given.items())
+        text = f"the actor cannot take {listed}"
+        if wanted and any(x.dtype not in wanted for x in given.values()):
+            names = ", ".join(map(str, wanted))
+            raise TypeError(f"{text}: its parameters are {names}; convert the data, or the actor, to one type") from error
+        raise ValueError(f"{text}: check the size that its network was made for ({str(error).splitlines()[0]})") from error
 
 
 def _is_stackable(module: nn.Module) -> bool:
@@ -109,7 +138,7 @@ def get_stacked_dist(
         raise NotImplementedError("stacked members need an actor with one distribution (return_composite=False)")
 
     if parts is not None and _is_stackable(parts[0].module):
-        with params.to_module(actor, preserve_module_state=False):
+        with params.to_module(actor, preserve_module_state=False), _named_inputs(actor, inputs):
             return parts[1].get_dist(_call(parts[0], [inputs.get(key) for key in parts[0].in_keys]))
 
     def call(params: TensorDictBase, *given: Any) -> Any:
@@ -117,9 +146,10 @@ def get_stacked_dist(
             return actor.get_dist_params(*given) if parts is None else _call(parts[0], given)
 
     vectorized = torch.vmap(call, randomness=randomness)
-    if parts is None:
-        return actor.build_dist_from_params(vectorized(params, inputs.copy()))
-    return parts[1].get_dist(vectorized(params, *(inputs.get(key) for key in parts[0].in_keys)))
+    with _named_inputs(actor, inputs):
+        if parts is None:
+            return actor.build_dist_from_params(vectorized(params, inputs.copy()))
+        return parts[1].get_dist(vectorized(params, *(inputs.get(key) for key in parts[0].in_keys)))
 
 
 def log_prob_of(dist: Distribution, inputs: TensorDictBase, action_key: NestedKey) -> Tensor:
@@ -145,10 +175,40 @@ def log_prob_of(dist: Distribution, inputs: TensorDictBase, action_key: NestedKe
             f"{action_key!r} has shape {list(action.shape)}, the actor's distribution {list(expected)}: the two must "
             "be equal (check the actor's action_dim and the batch size)"
         )
-    log_prob = dist.log_prob(action)
-    if log_prob.shape != inputs.batch_size:
+    log_prob = _safe_log_prob(dist, action)
+    shape, batch = log_prob.shape, inputs.batch_size
+    # Without a batch size of its own the batch is what all inputs have in common, as for TorchRL's losses.
+    fits = shape == batch if batch else all(x.shape[: len(shape)] == shape for x in inputs.values(True, True))
+    if not fits:
         raise ValueError(
-            f"log_prob has shape {list(log_prob.shape)}, the batch {list(inputs.batch_size)}: give the batch its "
+            f"log_prob has shape {list(shape)}, the batch {list(batch)}: give the batch its "
             "full batch size, and use a distribution that sums over the action's dimensions (IndependentNormal)"
         )
     return log_prob
+
+
+def _safe_log_prob(dist: Distribution, action: Tensor) -> Tensor:
+    """Log-density that is -inf, without gradient, for actions so far away that their gradient would overflow.
+
+    The rating of such an action is 0, and 0 * inf would be NaN in the gradient of every parameter.
+    """
+    if not action.is_floating_point():
+        return dist.log_prob(action)
+    with torch.no_grad():
+        if type(dist.base_dist if isinstance(dist, Independent) else dist) is Normal:
+            far = ((action - dist.mean) / dist.stddev).abs() > _FAR
+            instead = dist.mean
+        else:
+            far, instead = action.isinf(), torch.zeros_like(action)
+        action = torch.where(far, instead, action)
+        far = far.any(-1) if dist.event_shape else far
+    return dist.log_prob(action).masked_fill(far, -math.inf)
+
+
+def own_parameters(params: TensorDictParams) -> TensorDictParams:
+    """Parameters as copies that an optimizer takes, where there is a gradient to take."""
+
+    def own(x: Tensor) -> Tensor:
+        return nn.Parameter(x.detach().clone()) if x.requires_grad else x.clone()
+
+    return TensorDictParams(params.apply(own), no_convert=True)

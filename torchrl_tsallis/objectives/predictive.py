@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase, TensorDictParams
-from tensordict.nn import ProbabilisticTensorDictSequential, dispatch
+from tensordict.nn import ProbabilisticTensorDictSequential
 from tensordict.utils import NestedKey, expand_right, unravel_key
 from torch import Tensor
+from torch.distributions import Distribution
 
-from torchrl_tsallis.objectives.actor import log_prob_of
+from torchrl_tsallis._checks import check_number
 from torchrl_tsallis.objectives.bc import TsallisBCLoss
-from torchrl_tsallis.objectives.reference import ReferenceDensity
+from torchrl_tsallis.ratings.base import Evidence, Rated
 
 
 class PredictiveBCLoss(TsallisBCLoss):
@@ -24,7 +25,8 @@ class PredictiveBCLoss(TsallisBCLoss):
         \frac{1}{O} \lVert \hat{o}_{t+1}(\theta) - o_{t+1} \rVert^2 \right]
 
     A recurrent state that predicts what comes next holds what the policy has to know of the past. The second term is
-    not rated: what follows an operator's fault is physics as well. Both come from one pass of the network.
+    not rated by default: what follows an operator's fault is physics as well. ``rate_prediction`` weighs it by the
+    samples' ratings too. Both come from one pass of the network.
 
     Reads what :class:`~torchrl_tsallis.TsallisBCLoss` does, and the next observation, ``[*B, O]``. Writes its keys and
 
@@ -41,8 +43,8 @@ class PredictiveBCLoss(TsallisBCLoss):
 
     Keyword Args:
         prediction_weight (float): beta, not negative. Default: 1.0.
-        q, gamma_mix, gamma_min, gamma_max, reference, reduction, sync_stats, process_group: as for
-            :class:`~torchrl_tsallis.TsallisBCLoss`.
+        rate_prediction (bool): whether a sample's prediction error counts by its rating too. Default: False.
+        **settings: as for :class:`~torchrl_tsallis.TsallisBCLoss`.
 
     Raises:
         ValueError: for a negative weight, an actor that writes no prediction, or stacked members.
@@ -73,7 +75,6 @@ class PredictiveBCLoss(TsallisBCLoss):
 
     tensor_keys: _AcceptedKeys
     default_keys = _AcceptedKeys
-    out_keys = [*TsallisBCLoss.out_keys, "loss_prediction"]
 
     actor_network: ProbabilisticTensorDictSequential
     actor_network_params: TensorDictParams
@@ -84,32 +85,16 @@ class PredictiveBCLoss(TsallisBCLoss):
         actor_network: ProbabilisticTensorDictSequential,
         *,
         prediction_weight: float = 1.0,
-        q: float = 0.8,
-        gamma_mix: float | Literal["adaptive"] = "adaptive",
-        gamma_min: float = 0.1,
-        gamma_max: float = 0.9,
-        reference: ReferenceDensity | None = None,
-        reduction: Literal["mean", "sum", "none"] | None = None,
-        sync_stats: bool = True,
-        process_group: Any = None,
+        rate_prediction: bool = False,
+        **settings: Any,
     ) -> None:
-        if not prediction_weight >= 0:
-            raise ValueError(f"prediction_weight must not be negative, got {prediction_weight}")
-        super().__init__(
-            actor_network,
-            q=q,
-            gamma_mix=gamma_mix,
-            gamma_min=gamma_min,
-            gamma_max=gamma_max,
-            reference=reference,
-            reduction=reduction,
-            sync_stats=sync_stats,
-            process_group=process_group,
-        )
+        check_number("prediction_weight", prediction_weight, low=0)
+        super().__init__(actor_network, **settings)
         if self.num_members is not None:
             raise ValueError("PredictiveBCLoss has one policy: torch.vmap cannot stack LSTM layers")
         self.prediction_weight = prediction_weight
-        self._prediction: Tensor | None = None
+        self.rate_prediction = rate_prediction
+        self.out_keys = [*self.out_keys, "loss_prediction"]
         self._check_prediction()
 
     def _check_prediction(self) -> None:
@@ -138,35 +123,24 @@ class PredictiveBCLoss(TsallisBCLoss):
     def in_keys(self, values: list[NestedKey]) -> None:
         self._in_keys = values
 
-    def _dist_log_prob(
-        self, inputs: TensorDictBase, params: TensorDictParams
-    ) -> tuple[torch.distributions.Distribution, Tensor]:
-        """As in the parent; keeps the policy's prediction, not the target network's, of the same pass."""
+    def _pass(self, inputs: TensorDictBase, params: TensorDictParams) -> tuple[Distribution, Tensor]:
+        """As in the parent, and the prediction of the same pass."""
         written = inputs.copy()
         with params.to_module(self.actor_network, preserve_module_state=False):
             dist = self.actor_network.get_dist(written)
-        if params is self.actor_network_params:
-            self._prediction = written.get(self.tensor_keys.prediction)
-        return dist, log_prob_of(dist, inputs, self.tensor_keys.action)
+        return dist, written.get(self.tensor_keys.prediction)
 
-    @dispatch
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Computes both losses and the statistics.
-
-        Args:
-            tensordict: demonstrations with the keys of ``in_keys``, ``[*B]``; a mask under ``loss_mask_key`` selects.
-
-        Returns:
-            A tensordict with the keys of ``out_keys``.
-        """
-        out = super().forward(tensordict)
-        following, mask = tensordict.get(self.tensor_keys.next_observation), self._mask(tensordict)
-        prediction, self._prediction = self._prediction, None
-        if prediction is None or prediction.shape != following.shape:
-            shape = None if prediction is None else list(prediction.shape)
-            raise ValueError(f"the prediction has shape {shape}, the next observation {list(following.shape)}")
+    def _more(self, evidence: Evidence, rated: Rated, tensordict: TensorDictBase) -> dict[str, Tensor]:
+        """The prediction's loss."""
+        following, prediction, mask = tensordict.get(self.tensor_keys.next_observation), evidence.written, evidence.batch.mask
+        if prediction.shape != following.shape:
+            raise ValueError(
+                f"the prediction has shape {list(prediction.shape)}, the next observation {list(following.shape)}: "
+                "the actor's obs_dim has to be that of the data"
+            )
         if mask is not None:  # before the square, whose gradient a NaN in the padding would reach
             following = following.where(expand_right(mask, following.shape), torch.zeros_like(following))
         error = (prediction - following).square().mean(-1)
-        out["loss_prediction"] = self.prediction_weight * self._reduce_loss(error, tensordict)
-        return out
+        if self.rate_prediction:
+            error = error * rated.weight
+        return {"loss_prediction": self.prediction_weight * self._reduced(error, evidence.batch)}

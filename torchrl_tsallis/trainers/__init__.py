@@ -7,7 +7,6 @@ from torchrl_tsallis.trainers.hooks import EvaluationHook
 from torchrl_tsallis.trainers.logging import LoggerGroup, make_logger
 from torchrl_tsallis.trainers.memory import keep_freed_memory
 from torchrl_tsallis.trainers.offline import GuardedStepper, OfflineClock, SampleHook, make_offline_trainer
-from torchrl_tsallis.trainers.q_tuner import QTuner, q_gradient, q_objective, q_of_phi
 from torchrl_tsallis.trainers.stacked import LogMembers, MemberStepper
 
 __all__ = [
@@ -17,13 +16,9 @@ __all__ = [
     "LoggerGroup",
     "MemberStepper",
     "OfflineClock",
-    "QTuner",
     "SampleHook",
     "keep_freed_memory",
     "make_logger",
     "make_offline_trainer",
-    "q_gradient",
-    "q_objective",
-    "q_of_phi",
     "resume",
 ]

@@ -12,6 +12,9 @@ group                   name             builds
 ``target_net_updater``  ``cat_soft``     :class:`~torchrl_tsallis.CATSoftUpdate`
 ``optimizer``           ``adaterm``      :class:`~torchrl_tsallis.AdaTerm`
 ``tuner``               ``q_tuner``      :class:`~torchrl_tsallis.QTuner`
+``tuner``               ``score_tuner``  :class:`~torchrl_tsallis.ScoreTuner`
+``rating``              ``tsallis``      :class:`~torchrl_tsallis.TsallisRating`
+``rating``              ``peak``         :class:`~torchrl_tsallis.PeakRating`
 ``trainer``             ``offline``      :func:`~torchrl_tsallis.trainers.make_offline_trainer`
 ======================  ===============  =======================================================
 
@@ -90,11 +93,7 @@ class TsallisBCLossConfig(LossConfig):
     """Configuration of :class:`~torchrl_tsallis.TsallisBCLoss`."""
 
     actor_network: Any = None
-    q: Any = 0.8
-    gamma_mix: Any = "adaptive"
-    gamma_min: float = 0.1
-    gamma_max: float = 0.9
-    reference: Any = None
+    rating: Any = None
     reduction: str | None = None
     sync_stats: bool = True
     process_group: Any = None
@@ -106,7 +105,37 @@ class PredictiveBCLossConfig(TsallisBCLossConfig):
     """Configuration of :class:`~torchrl_tsallis.PredictiveBCLoss`."""
 
     prediction_weight: float = 1.0
+    rate_prediction: bool = False
     _target_: str = "torchrl_tsallis.trainers.configs.make_predictive_loss"
+
+
+@dataclass
+class TsallisRatingConfig(ConfigBase):
+    """Configuration of :class:`~torchrl_tsallis.TsallisRating`."""
+
+    q: Any = 0.8
+    gamma_mix: Any = "adaptive"
+    gamma_min: float = 0.1
+    gamma_max: float = 0.9
+    beta: Any = 0.0
+    _target_: str = "torchrl_tsallis.TsallisRating"
+    _convert_: str = "all"
+
+    def __post_init__(self) -> None:
+        """Nothing to check: the rating does."""
+
+
+@dataclass
+class PeakRatingConfig(ConfigBase):
+    """Configuration of :class:`~torchrl_tsallis.PeakRating`."""
+
+    u: Any = 0.2
+    beta: Any = 0.5
+    _target_: str = "torchrl_tsallis.PeakRating"
+    _convert_: str = "all"
+
+    def __post_init__(self) -> None:
+        """Nothing to check: the rating does."""
 
 
 @dataclass
@@ -154,6 +183,21 @@ class QTunerConfig(ConfigBase):
     lr: float = 1e-3
     optimizer: Any = None
     _target_: str = "torchrl_tsallis.QTuner"
+    _partial_: bool = True
+
+    def __post_init__(self) -> None:
+        """Nothing to check: the tuner does."""
+
+
+@dataclass
+class ScoreTunerConfig(ConfigBase):
+    """Configuration of :class:`~torchrl_tsallis.ScoreTuner`, a partial that waits for the loss."""
+
+    tuned: list[bool] | None = None
+    u_max: float = 0.5
+    lr: float = 3e-3
+    optimizer: Any = None
+    _target_: str = "torchrl_tsallis.ScoreTuner"
     _partial_: bool = True
 
     def __post_init__(self) -> None:
@@ -218,6 +262,9 @@ def register() -> None:
         ("target_net_updater", "cat_soft", CATSoftUpdateConfig),
         ("optimizer", "adaterm", AdaTermConfig),
         ("tuner", "q_tuner", QTunerConfig),
+        ("tuner", "score_tuner", ScoreTunerConfig),
+        ("rating", "tsallis", TsallisRatingConfig),
+        ("rating", "peak", PeakRatingConfig),
         ("trainer", "offline", OfflineTrainerConfig),
     ):
         store.store(group=group, name=name, node=node)

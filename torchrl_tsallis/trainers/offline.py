@@ -20,7 +20,7 @@ from torchrl.objectives.utils import TargetNetUpdater
 from torchrl.record.loggers.common import Logger
 from torchrl.trainers import DefaultOptimizationStepper, Trainer, TrainerHookBase
 
-from torchrl_tsallis.trainers.q_tuner import QTuner
+from torchrl_tsallis.ratings.tuner import RatingTuner
 from torchrl_tsallis.trainers.stacked import LogMembers, MemberStepper
 
 
@@ -164,7 +164,7 @@ def make_offline_trainer(
     *,
     steps: int,
     updater: TargetNetUpdater | None = None,
-    tuner: QTuner | None = None,
+    tuner: RatingTuner | None = None,
     logger: Logger | None = None,
     log_every: int = 100,
     checkpoint_dir: str | os.PathLike[str] | None = None,
@@ -174,7 +174,7 @@ def make_offline_trainer(
     clip_norm: float | None = None,
     progress: bool = True,
 ) -> Trainer:
-    """Assembles TorchRL's trainer for a fixed data set. After each optimizer step the target follows, then q is tuned.
+    """Assembles TorchRL's trainer for a fixed data set. After each optimizer step the target follows, then the rating is tuned.
 
     Args:
         loss: the loss, as ``TsallisBCLoss``.
@@ -182,7 +182,7 @@ def make_offline_trainer(
         optimizer: of the loss's parameters.
         steps: gradient steps in all, a multiple of ``log_every``.
         updater: follows the policy by the target network. Default: None.
-        tuner: tunes q. Default: None.
+        tuner: tunes the rating. Default: None.
         logger: gets the averages of everything the loss returns. Default: None.
         log_every: steps between two logged points (100); also the grain of evaluation, stopping and saving.
         checkpoint_dir: folder of the checkpoints. Default: None, nothing is saved.

@@ -19,7 +19,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from torchrl_tsallis.q_logarithm import MAX_EXPONENT, _QLogarithm, as_like, exp_q, ln_q
+from torchrl_tsallis.ratings.base import weighted_loss
+from torchrl_tsallis.ratings.tsallis.q_logarithm import MAX_EXPONENT, _QLogarithm, as_like, exp_q, ln_q
 
 __all__ = [
     "MAX_EXPONENT",
@@ -29,28 +30,11 @@ __all__ = [
     "exp_q",
     "ln_q",
     "log_mixture",
-    "per_sample",
     "rated_nll",
+    "rated_value",
     "rating",
     "tsallis_nll",
 ]
-
-
-def per_sample(value: Tensor, samples: Tensor) -> Tensor:
-    """Shapes one value per member so that it broadcasts over the member's samples.
-
-    Args:
-        value: ``[*S]``, or a scalar, which broadcasts as it is.
-        samples: ``[*S, *B]``.
-
-    Returns:
-        A view of ``value``, ``[*S, 1, ...]``.
-
-    Examples:
-        >>> per_sample(torch.ones(3), torch.ones(3, 4, 5)).shape
-        torch.Size([3, 1, 1])
-    """
-    return value[(...,) + (None,) * (samples.ndim - value.ndim)] if value.ndim else value
 
 
 def log_mixture(target_log_prob: Tensor, gamma: float | Tensor) -> Tensor:
@@ -95,7 +79,9 @@ def rating(log_prob: Tensor, log_reference: float | Tensor, q: float | Tensor) -
         >>> rating(torch.tensor([-10.0, 0.0]), 0.0, 0.8)
         tensor([0.1353, 1.0000])
     """
-    return ((1 - as_like(q, log_prob)) * (log_prob - log_reference)).clamp(max=MAX_EXPONENT).exp()
+    u = 1 - as_like(q, log_prob)
+    # An action of density 0 is still rated 1 at q = 1, where 0 * inf would be NaN.
+    return (u * (log_prob - log_reference)).where(u != 0, 0.0).clamp(max=MAX_EXPONENT).exp()
 
 
 def tsallis_nll(log_prob: Tensor, log_reference: float | Tensor, q: float | Tensor) -> Tensor:
@@ -125,11 +111,37 @@ def tsallis_nll(log_prob: Tensor, log_reference: float | Tensor, q: float | Tens
     return constant - ln_q(log_prob - reference, q)
 
 
-def rated_nll(log_prob: Tensor, log_reference: float | Tensor, q: float | Tensor) -> tuple[Tensor, Tensor]:
+def rated_value(log_prob: Tensor, log_reference: float | Tensor, q: float | Tensor) -> tuple[Tensor, Tensor]:
     r"""Loss and rating of every sample, as :func:`tsallis_nll` and :func:`rating` give them, for less than one of them.
 
-    The loss is a surrogate, ``value - rating * (log_prob - log_prob.detach())`` with detached value and rating: its
-    first derivative is exact, there is no second one, and none with respect to q or the reference.
+    Args:
+        log_prob: imitator's log-density, ``[*B]``; no gradient flows through either result.
+        log_reference: log-density of the reference, ``[*B]`` or a number.
+        q: Tsallis index.
+
+    Returns:
+        The loss and the rating, ``[*B]`` each.
+
+    Examples:
+        >>> rated_value(torch.tensor([-10.0, -1.0]), 0.0, 0.8)
+        (tensor([4.3233, 0.9063]), tensor([0.1353, 0.8187]))
+    """
+    with torch.no_grad():
+        reference = as_like(log_reference, log_prob)
+        u = 1 - as_like(q, log_prob)
+        plain = u == 0
+        z = (u * (log_prob - reference)).masked_fill(plain, 0.0).clamp(max=MAX_EXPONENT)
+        # ln_q(1 / reference) - ln_q(pi / reference); a reference of 1 has no first part
+        value = (-u * reference).clamp(max=MAX_EXPONENT).expm1() - z.expm1()
+        return torch.where(plain, -log_prob, value / torch.where(plain, 1.0, u)), z.exp()
+
+
+def rated_nll(log_prob: Tensor, log_reference: float | Tensor, q: float | Tensor) -> tuple[Tensor, Tensor]:
+    r"""The loss of every sample with a gradient, and its rating.
+
+    The loss is a surrogate, ``value - rating * (log_prob - log_prob.detach())`` with the value and rating of
+    :func:`rated_value`: its first derivative is exact, there is no second one, and none with respect to q or the
+    reference.
 
     Args:
         log_prob: imitator's log-density, ``[*B]``.
@@ -141,23 +153,13 @@ def rated_nll(log_prob: Tensor, log_reference: float | Tensor, q: float | Tensor
         graph, ``[*B]``.
 
     Examples:
-        >>> loss, weight = rated_nll(torch.tensor([-10.0, -1.0]), 0.0, 0.8)
-        >>> loss, weight
-        (tensor([4.3233, 0.9063]), tensor([0.1353, 0.8187]))
+        >>> x = torch.tensor([-10.0, -1.0], requires_grad=True)
+        >>> loss, weight = rated_nll(x, 0.0, 0.8)
+        >>> torch.autograd.grad(loss.sum(), x)
+        (tensor([-0.1353, -0.8187]),)
     """
-    with torch.no_grad():
-        constant, reference = log_prob.detach(), as_like(log_reference, log_prob)
-        u = 1 - as_like(q, log_prob)
-        plain = u == 0
-        z = (u * (constant - reference)).clamp(max=MAX_EXPONENT)
-        # ln_q(1 / reference) - ln_q(pi / reference); a reference of 1 has no first part
-        value = (-u * reference).clamp(max=MAX_EXPONENT).expm1() - z.expm1()
-        value = torch.where(plain, -constant, value / torch.where(plain, 1.0, u))
-        weight = z.exp()
-    if not log_prob.requires_grad:
-        return value, weight
-    # An action outside of the distribution's support has -inf - -inf here, and no gradient.
-    return torch.addcmul(value, weight, (log_prob - constant).nan_to_num(0.0, 0.0, 0.0), value=-1), weight
+    value, weight = rated_value(log_prob.detach(), log_reference, q)
+    return weighted_loss(value, weight, log_prob), weight
 
 
 def density_moment(log_prob: Tensor, q: float | Tensor, dim: int = -1) -> Tensor:

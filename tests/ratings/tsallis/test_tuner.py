@@ -12,7 +12,7 @@ from torch.autograd import gradcheck
 
 from torchrl_tsallis import QTuner, TsallisBCLoss
 from torchrl_tsallis.modules import make_policy
-from torchrl_tsallis.trainers import q_gradient, q_objective, q_of_phi
+from torchrl_tsallis.ratings.tsallis import q_gradient, q_objective, q_of_phi
 
 
 def make_loss(gamma_mix: float | str = 0.0) -> TsallisBCLoss:
@@ -92,7 +92,7 @@ def test_step_reads_the_last_batch_and_leaves_the_policy_alone():
     tuner = QTuner(loss)
     loss(TensorDict({"observation": torch.randn(6, 3), "action": torch.zeros(6, 2)}, [6]))["loss_tsallis_bc"].backward()
     before = [p.grad.clone() for p in loss.parameters()]
-    expected = q_objective(loss.last_log_prob, torch.tensor(0.0), gamma=0.0)
+    expected = q_objective(loss.last_evidence[0], torch.tensor(0.0), gamma=0.0)
     torch.testing.assert_close(tuner.step(), expected)
     torch.testing.assert_close([p.grad for p in loss.parameters()], before)
     assert not any(p is tuner.phi for p in loss.parameters())

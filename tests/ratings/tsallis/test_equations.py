@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch.autograd import gradcheck
 
-from torchrl_tsallis import functional as F
+from torchrl_tsallis.ratings.tsallis import equations as F
 
 LOG_X = [-1e4, -300.0, -20.0, -1.0, -1e-3, 0.0, 1e-3, 1.0, 20.0, 60.0]
 QS = [1.0, 1 - 1e-9, 1 - 1e-6, 0.999, 0.95, 0.8, 0.6, 0.3, 0.0]

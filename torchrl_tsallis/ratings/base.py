@@ -1,0 +1,258 @@
+"""What a rating is: the weight that a sample has in imitation, from the imitator's own likelihood of it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from numbers import Real
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import torch
+from torch import Tensor, nn
+from torch.distributions import Distribution
+
+from torchrl_tsallis.ratings.batch import Batch
+from torchrl_tsallis.ratings.normal import diagonal_normal, scale_weighted_log_prob
+
+if TYPE_CHECKING:
+    from torchrl_tsallis.ratings.tuner import RatingTuner
+
+
+class Evidence(NamedTuple):
+    """What a rating is given of a batch. With stacked members every shape has their dimension first, ``[S, *B]``.
+
+    Attributes:
+        log_prob: the imitator's log-density at the actions, with gradient, ``[*B]``.
+        likelihood: what the policy climbs, with gradient, ``[*B]``: ``log_prob``, or its scale-weighted form where the
+            rating's ``beta`` asks for that.
+        dist: the imitator's distribution, batch shape ``[*B]``.
+        action: the demonstrated actions, ``[*B, A]`` or ``[*B]``; a tensordict for a composite distribution.
+        target_log_prob: the target network's log-density, ``[*B]``; None unless the rating ``needs_target``.
+        batch: gives means over the batch, ``batch.mean(x)``.
+        written: what else the loss has taken of the same pass of the network. Default: None.
+    """
+
+    log_prob: Tensor
+    likelihood: Tensor
+    dist: Distribution
+    action: Any
+    target_log_prob: Tensor | None
+    batch: Batch
+    written: Any = None
+
+    def loss(self, value: Tensor, weight: Tensor) -> Tensor:
+        """A loss with the given value, whose gradient is minus ``weight`` times the likelihood's.
+
+        Args:
+            value: what the loss says of each sample, ``[*B]``, without gradient.
+            weight: rating of each sample, ``[*B]``, without gradient.
+
+        Returns:
+            The loss, ``[*B]``: a surrogate with an exact first derivative, and no second one.
+        """
+        return weighted_loss(value, weight, self.likelihood)
+
+
+class Rated(NamedTuple):
+    """What a rating says of a batch.
+
+    Attributes:
+        loss: of each sample, with gradient, ``[*B]``.
+        weight: the rating of each sample, its gradient relative to plain behavioral cloning's, ``[*B]``.
+        evidence: what the rating's tuner works on, ``[*B]``, detached.
+        logged: scalars by name, or ``[S]`` with members, detached.
+    """
+
+    loss: Tensor
+    weight: Tensor
+    evidence: Tensor
+    logged: dict[str, Tensor]
+
+
+def weighted_loss(value: Tensor, weight: Tensor, likelihood: Tensor) -> Tensor:
+    """A surrogate with the given value, whose gradient with respect to ``likelihood`` is minus ``weight``.
+
+    Args:
+        value: ``[*B]``, detached.
+        weight: ``[*B]``, detached.
+        likelihood: ``[*B]``.
+
+    Returns:
+        ``value - weight * (likelihood - likelihood.detach())``, ``[*B]``.
+
+    Examples:
+        >>> x = torch.tensor(2.0, requires_grad=True)
+        >>> loss = weighted_loss(torch.tensor(7.0), torch.tensor(0.5), x)
+        >>> loss.backward()
+        >>> loss.item(), x.grad.item()
+        (7.0, -0.5)
+    """
+    if not likelihood.requires_grad:
+        return value
+    # An action outside of the distribution's support has -inf - -inf here, and no gradient.
+    change = (likelihood - likelihood.detach()).nan_to_num(0.0, 0.0, 0.0)
+    return torch.addcmul(value, weight, change, value=-1)
+
+
+class Rating(nn.Module):
+    """Base class: subclass it, implement :meth:`forward`, and pass an instance to ``TsallisBCLoss(actor, rating=...)``.
+
+    Settings that may differ between stacked members are declared by :meth:`add_setting`; they become buffers, scalars
+    or ``[S]``, and are checkpointed with the loss.
+
+    Args:
+        beta: power of the scale-weighted likelihood, in [0, 1]; each dimension's log-density is multiplied by
+            its detached ``scale^(2 beta)``. 0 is the plain likelihood. Needs a distribution with a location and scale,
+            as :func:`~torchrl_tsallis.ratings.normal.diagonal_normal` finds them.
+
+    Examples:
+        >>> class Threshold(Rating):  # takes no sample whose density is under 1
+        ...     def forward(self, evidence):
+        ...         value = -evidence.log_prob.detach()
+        ...         weight = (value < 0).to(value)
+        ...         return Rated(evidence.loss(value, weight), weight, value, {})
+        >>> Threshold().needs_target
+        False
+    """
+
+    #: Whether the target network's log-density is needed.
+    needs_target: bool = False
+    #: Names of what ``forward`` logs, in the order in which the loss returns them.
+    logged: tuple[str, ...] = ()
+
+    beta: Tensor
+
+    def __init__(self, beta: float | Sequence[float] = 0.0) -> None:
+        super().__init__()
+        self._settings: list[str] = []
+        self.add_setting("beta", beta, 0, 1)
+        #: Whether any member has a scale-weighted likelihood.
+        self.scale_weighted = bool((self.beta > 0).any())
+
+    def add_setting(self, name: str, value: Any, low: float, high: float) -> None:
+        """Registers a number in [low, high], or one for each stacked member, as a buffer.
+
+        Args:
+            name: of the setting and its buffer.
+            value: a number, or a sequence of them.
+            low: the least that is allowed.
+            high: the largest that is allowed.
+
+        Raises:
+            ValueError: for anything else; the message names the setting.
+        """
+        self.register_buffer(name, torch.tensor(as_numbers(name, value, low, high), dtype=torch.float32))
+        self._settings.append(name)
+
+    def stack(self, num_members: int | None) -> None:
+        """Gives every setting the shape ``[S]`` of stacked members, or checks that there are none.
+
+        Args:
+            num_members: S; None for a single policy.
+
+        Raises:
+            ValueError: if a setting was given for another number of policies.
+        """
+        for name in self._settings:
+            value = getattr(self, name)
+            if value.ndim and len(value) != num_members:
+                raise ValueError(
+                    f"{name} has {len(value)} values for {num_members or 1} policies: give a number or one of each, and "
+                    "each loss a rating of its own"
+                )
+            if num_members is not None and not value.ndim:
+                setattr(self, name, value.repeat(num_members))
+
+    def likelihood(self, log_prob: Tensor, dist: Distribution, action: Any, batch: Batch) -> Tensor:
+        """What the policy climbs: the log-density, or its scale-weighted form where ``beta`` asks for that.
+
+        Args:
+            log_prob: ``[*B]``, with gradient.
+            dist: the imitator's distribution.
+            action: ``[*B, A]``.
+            batch: whose samples they are.
+
+        Returns:
+            The likelihood, ``[*B]``, with gradient.
+
+        Raises:
+            ValueError: if beta > 0 and the distribution is no diagonal normal.
+        """
+        if not self.scale_weighted:
+            return log_prob
+        normal = diagonal_normal(dist, action)
+        if normal is None:
+            raise ValueError(
+                f"beta > 0 needs a distribution with location and scale, the actor's is a {type(dist).__name__}: give the "
+                "rating beta=0"
+            )
+        return scale_weighted_log_prob(normal, batch.spread(self.beta.to(normal.loc), normal.loc))
+
+    @property
+    def target_members(self) -> Tensor | None:
+        """Which stacked members are rated by their target network, ``[S]`` bool; None for all of them."""
+        return None
+
+    @property
+    def variance_share(self) -> Tensor:
+        """Fitted variance as a share of the true one where the data is normal, a scalar or ``[S]``.
+
+        Raises:
+            NotImplementedError: if it is not known for this rating.
+        """
+        raise NotImplementedError(f"how {type(self).__name__} changes the fitted scale is not known")
+
+    def tuner(self) -> type[RatingTuner]:
+        """The class that tunes this rating.
+
+        Raises:
+            NotImplementedError: if nothing does.
+        """
+        raise NotImplementedError(f"nothing tunes {type(self).__name__}: its settings are fixed")
+
+    def forward(self, evidence: Evidence) -> Rated:
+        """Rates a batch.
+
+        Args:
+            evidence: of the batch.
+
+        Returns:
+            Loss and rating of each sample, and what is logged.
+        """
+        raise NotImplementedError
+
+
+def as_numbers(name: str, value: Any, low: float, high: float) -> float | list[float]:
+    """A setting as a number in [low, high], or a list of them.
+
+    Args:
+        name: for the message.
+        value: a number, or a sequence or tensor of numbers.
+        low: the least that is allowed.
+        high: the largest that is allowed.
+
+    Returns:
+        A float, or a list of floats.
+
+    Raises:
+        ValueError: for anything else, NaN included.
+
+    Examples:
+        >>> as_numbers("q", [1, 0.5], 0, 1)
+        [1.0, 0.5]
+        >>> as_numbers("q", None, 0, 1)
+        Traceback (most recent call last):
+        ...
+        ValueError: q must be a number in [0, 1], or a sequence of one for each stacked member, got None
+    """
+    plain = value.tolist() if isinstance(value, Tensor) else value
+    many = isinstance(plain, Sequence) and not isinstance(plain, str)
+    numbers = list(plain) if many else [plain]
+    for number in numbers:
+        if isinstance(number, bool) or not isinstance(number, Real) or not low <= number <= high:
+            break
+    else:
+        if numbers:
+            return [float(number) for number in numbers] if many else float(plain)
+    raise ValueError(
+        f"{name} must be a number in [{low:g}, {high:g}], or a sequence of one for each stacked member, got {value!r}"
+    )
