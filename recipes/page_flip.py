@@ -40,7 +40,19 @@ from torchrl_tsallis.trainers import EvaluationHook, LoggerGroup, make_logger, r
 
 Unit = tuple[int, str]  # seed, method: one training
 #: The entries of the configuration that decide about a policy and its trials.
-SETTINGS = ("policy", "loss", "ratings", "tuners", "optimizer", "updater", "data", "trials", "epochs", "slice_len", "num_slices")
+SETTINGS = (
+    "policy",
+    "loss",
+    "ratings",
+    "tuners",
+    "optimizer",
+    "updater",
+    "data",
+    "trials",
+    "epochs",
+    "slice_len",
+    "num_slices",
+)
 
 
 def units_of(cfg: DictConfig) -> list[Unit]:

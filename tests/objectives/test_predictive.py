@@ -109,12 +109,26 @@ def test_no_trajectory_changes_another():
 
 
 def test_noise_is_off_in_evaluation():
-    loss, data = make_loss(state_noise=0.1), batch()
-    assert not torch.equal(loss.rating(data), loss.rating(data))
+    loss, data = make_loss(state_noise=0.1, gamma_mix=0.5), batch()
+    assert not torch.equal(loss(data)["loss_tsallis_bc"], loss(data)["loss_tsallis_bc"])
+    torch.testing.assert_close(loss.rating(data), make_loss(gamma_mix=0.5).rating(data))
+    assert loss.training and loss.actor_network.training, "rating leaves the mode as it was"
     loss.eval()
-    assert torch.equal(loss.rating(data), loss.rating(data))
-    torch.testing.assert_close(loss.rating(data), make_loss().rating(data))
+    torch.testing.assert_close(loss(data), make_loss(gamma_mix=0.5).eval()(data))
     assert loss.train().actor_network.training
+
+
+@pytest.mark.parametrize("reduction", ["mean", "none"])
+def test_the_prediction_is_rated_on_request(reduction):
+    data = batch()
+    data["action"][0] += 3.0
+    plain, rated = (make_loss(gamma_mix=0.0, reduction="none", rate_prediction=rate)(data) for rate in (False, True))
+    weight = make_loss(gamma_mix=0.0).rating(data)
+    assert weight.min() < 0.9 * weight.max()
+    expected = plain["loss_prediction"] * weight
+    got = make_loss(gamma_mix=0.0, reduction=reduction, rate_prediction=True)(data)["loss_prediction"]
+    torch.testing.assert_close(rated["loss_prediction"], expected)
+    torch.testing.assert_close(got, expected if reduction == "none" else expected.mean())
 
 
 def test_dispatch_and_other_keys():

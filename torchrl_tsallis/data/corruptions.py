@@ -147,9 +147,7 @@ def make_task(
     return out
 
 
-def replace_pairs(
-    experts: TensorDictBase, others: TensorDictBase, *, share: float, seed: int = 0
-) -> TensorDict:
+def replace_pairs(experts: TensorDictBase, others: TensorDictBase, *, share: float, seed: int = 0) -> TensorDict:
     """Replaces randomly chosen pairs, one by one, by pairs of other demonstrators: samples that contradict each other.
 
     Args:

@@ -100,8 +100,12 @@ def _named_inputs(actor: nn.Module, inputs: TensorDictBase) -> Iterator[None]:
         text = f"the actor cannot take {listed}"
         if wanted and any(x.dtype not in wanted for x in given.values()):
             names = ", ".join(map(str, wanted))
-            raise TypeError(f"{text}: its parameters are {names}; convert the data, or the actor, to one type") from error
-        raise ValueError(f"{text}: check the size that its network was made for ({str(error).splitlines()[0]})") from error
+            raise TypeError(
+                f"{text}: its parameters are {names}; convert the data, or the actor, to one type"
+            ) from error
+        raise ValueError(
+            f"{text}: check the size that its network was made for ({str(error).splitlines()[0]})"
+        ) from error
 
 
 def _is_stackable(module: nn.Module) -> bool:

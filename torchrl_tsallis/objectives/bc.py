@@ -140,7 +140,9 @@ class TsallisBCLoss(AskedLoss, LossModule):
         if reduction not in (None, "mean", "sum", "none"):
             raise ValueError(f"reduction must be 'mean', 'sum' or 'none', got {reduction!r}")
         if rating is not None and tsallis:
-            raise ValueError(f"{', '.join(tsallis)} are settings of TsallisRating: give them to the rating, or no rating")
+            raise ValueError(
+                f"{', '.join(tsallis)} are settings of TsallisRating: give them to the rating, or no rating"
+            )
         if not isinstance(rating, Rating | None):
             raise TypeError(f"rating must be a Rating such as PeakRating(), got {rating!r}")
         rating = TsallisRating(**tsallis) if rating is None else rating

@@ -132,7 +132,11 @@ class PredictiveBCLoss(TsallisBCLoss):
 
     def _more(self, evidence: Evidence, rated: Rated, tensordict: TensorDictBase) -> dict[str, Tensor]:
         """The prediction's loss."""
-        following, prediction, mask = tensordict.get(self.tensor_keys.next_observation), evidence.written, evidence.batch.mask
+        following, prediction, mask = (
+            tensordict.get(self.tensor_keys.next_observation),
+            evidence.written,
+            evidence.batch.mask,
+        )
         if prediction.shape != following.shape:
             raise ValueError(
                 f"the prediction has shape {list(prediction.shape)}, the next observation {list(following.shape)}: "

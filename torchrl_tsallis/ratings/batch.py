@@ -47,7 +47,12 @@ class Batch:
     """
 
     def __init__(
-        self, mask: Tensor | None = None, *, members: bool = False, total: GlobalSum | None = None, num_processes: int = 1
+        self,
+        mask: Tensor | None = None,
+        *,
+        members: bool = False,
+        total: GlobalSum | None = None,
+        num_processes: int = 1,
     ) -> None:
         self.mask = mask
         self.members = members

@@ -75,7 +75,7 @@ def squared_distance(normal: DiagonalNormal) -> Tensor:
     """
     with torch.no_grad():
         z = (normal.value - normal.loc) / normal.scale
-        return torch.linalg.vector_norm(z, dim=-1).clamp_(max=math.sqrt(MAX_DISTANCE)).square_()
+        return torch.linalg.vector_norm(z, dim=-1).clamp(max=math.sqrt(MAX_DISTANCE)).square()
 
 
 def scale_weighted_log_prob(normal: DiagonalNormal, beta: Tensor) -> Tensor:
@@ -136,5 +136,5 @@ def surprise_of(distance: Tensor, dims: int, variance_share: Tensor) -> Tensor:
     # The survival function leaves the range of float64; the continued fraction's first terms are its asymptote there.
     tail = x.clamp_min(1.0)
     far = (a - 1) * tail.log() - tail - torch.lgamma(a) - torch.log1p(-(a - 1) / (tail + 1))
-    log_survival = torch.where(near > -600, near, far)
-    return (-log_survival / math.log(10)).clamp_min(0).to(distance.dtype)
+    log_survival = torch.where(near > -600, near, far).clamp_max(0)
+    return (log_survival / -math.log(10)).abs().to(distance.dtype)

@@ -125,7 +125,7 @@ class PeakRating(Rating):
     def __init__(self, u: float | Sequence[float] = 0.2, beta: float | Sequence[float] = 0.5) -> None:
         super().__init__(beta)
         self.add_setting("u", u, 0, 1)
-        self.nearness = RunningMean()
+        self.nearness = RunningMean(start=0.5)  # T = 1: the plain formula
         #: Action dimensions A of the last batch; None where its distribution is no diagonal normal.
         self.dims: int | None = None
 

@@ -13,6 +13,7 @@ class RunningMean(nn.Module):
 
     Args:
         momentum: weight of a new batch.
+        start: what is used in evaluation before any batch was seen. Default: None, the batch at hand's, with a warning.
 
     Examples:
         >>> mean = RunningMean(momentum=0.5)
@@ -23,15 +24,16 @@ class RunningMean(nn.Module):
     value: Tensor
     batches: Tensor
 
-    def __init__(self, momentum: float = 0.1) -> None:
+    def __init__(self, momentum: float = 0.1, start: float | None = None) -> None:
         super().__init__()
         self.momentum = momentum
-        self.register_buffer("value", torch.zeros(()))
+        self.start = start
+        self.register_buffer("value", torch.full((), start or 0.0))
         self.register_buffer("batches", torch.zeros((), dtype=torch.int64))  # seen, that were finite
 
     def stack(self, num_members: int | None) -> None:
         """Makes room for the statistics of ``num_members`` stacked members, or of one policy."""
-        self.value = self.value.new_zeros(() if num_members is None else (num_members,))
+        self.value = self.value.new_full(() if num_members is None else (num_members,), self.start or 0.0)
         self.batches = torch.zeros_like(self.value, dtype=torch.int64)
 
     def forward(self, statistic: Tensor) -> Tensor:
@@ -44,7 +46,7 @@ class RunningMean(nn.Module):
             The statistic to use, of the same shape.
         """
         if not self.training:
-            if torch.compiler.is_compiling() or bool(self.batches.all()):
+            if self.start is not None or torch.compiler.is_compiling() or bool(self.batches.all()):
                 return self.value.to(statistic)
             warnings.warn(
                 "no batch was seen in training mode, so that the statistics are those of the batch at hand: call the "

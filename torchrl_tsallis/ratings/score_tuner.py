@@ -118,7 +118,7 @@ class ScoreTuner(RatingTuner):
         >>> _ = loss(TensorDict({"observation": torch.zeros(5, 3), "action": torch.zeros(5, 2)}, [5]))
         >>> score = tuner.step()
         >>> round(loss.rating_module.u.item(), 4)
-        0.2004
+        0.1996
     """
 
     rating_class = PeakRating
@@ -142,7 +142,9 @@ class ScoreTuner(RatingTuner):
         share = self.rating.u / self.u_max
         inside = (share > 0) & (share < 1)
         if not bool((inside if self.tuned is None else inside | ~self.tuned).all()):
-            raise ValueError(f"a tuned u must start in (0, {self.u_max:g}), the bounds of ScoreTuner, got {self.rating.u}")
+            raise ValueError(
+                f"a tuned u must start in (0, {self.u_max:g}), the bounds of ScoreTuner, got {self.rating.u}"
+            )
         return share.where(inside, 0.5).logit()
 
     def slope(self, evidence: Tensor, batch: Batch) -> tuple[Tensor, Tensor]:

@@ -37,18 +37,20 @@ class RatingTuner(TrainerHookBase):
     #: The ratings that it fits.
     rating_class: type[Rating] = Rating
 
-    def __init__(
-        self, loss: TsallisBCLoss, *, tuned: Sequence[bool] | None, optimizer: MakeOptimizer
-    ) -> None:
+    def __init__(self, loss: TsallisBCLoss, *, tuned: Sequence[bool] | None, optimizer: MakeOptimizer) -> None:
         name, rating = type(self).__name__, getattr(loss, "rating_module", None)
         if rating is None:
-            raise ValueError(f"{name} needs a loss that rates its samples, got {type(loss).__name__}: use TsallisBCLoss")
+            raise ValueError(
+                f"{name} needs a loss that rates its samples, got {type(loss).__name__}: use TsallisBCLoss"
+            )
         if not isinstance(rating, self.rating_class):
             try:
                 advice = f"use {rating.tuner().__name__}"
             except NotImplementedError as error:
                 advice = str(error)
-            raise ValueError(f"{name} tunes {self.rating_class.__name__}, the loss has {type(rating).__name__}: {advice}")
+            raise ValueError(
+                f"{name} tunes {self.rating_class.__name__}, the loss has {type(rating).__name__}: {advice}"
+            )
         members = loss.num_members
         if tuned is not None and len(tuned) != members:
             raise ValueError(f"tuned has {len(tuned)} values for {members or 'no'} stacked members")

@@ -166,5 +166,7 @@ def _levels(gamma_mix: Any, bound: float) -> Any:
     try:
         numbers = as_numbers("gamma_mix", levels if many else levels[0], 0, 1)
     except ValueError:
-        raise ValueError(f"gamma_mix must be 'adaptive' or a number in [0, 1], or a sequence, got {gamma_mix!r}") from None
+        raise ValueError(
+            f"gamma_mix must be 'adaptive' or a number in [0, 1], or a sequence, got {gamma_mix!r}"
+        ) from None
     return numbers

@@ -193,7 +193,9 @@ class QTuner(RatingTuner):
         super().__init__(loss, tuned=tuned, optimizer=make)
         relative = self.rating.gamma_low == 1
         if bool((relative if self.tuned is None else relative & self.tuned).any()):
-            raise ValueError("QTuner needs gamma_mix < 1: eq. 15 divides by 1 - gamma; use a fixed q with the pure relative rating")
+            raise ValueError(
+                "QTuner needs gamma_mix < 1: eq. 15 divides by 1 - gamma; use a fixed q with the pure relative rating"
+            )
 
     def slope(self, evidence: Tensor, batch: Batch) -> tuple[Tensor, Tensor]:
         """See :meth:`RatingTuner.slope`; the evidence is the log-density."""
