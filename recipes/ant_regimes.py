@@ -1,7 +1,7 @@
 """Where each rating works: experts' noise, gaits, units and conflicting pairs, on PyBullet's Ant.
 
-Trains and evaluates every combination of each grid of the configuration, ten episodes each. It may be killed and started
-again at any time; what is done is not done twice::
+Trains and evaluates every combination of each grid of the configuration. It may be killed and started again at any
+time; what is done is not done twice::
 
     python recipes/ant_regimes.py
     python recipes/ant_regimes.py part=[both] seeds=[300,301]

@@ -20,9 +20,9 @@ from torchrl.modules import (
 from torchrl.objectives import SoftUpdate
 
 from torchrl_tsallis import TsallisBCLoss
-from torchrl_tsallis.ratings.tsallis.equations import log_mixture, rating
 from torchrl_tsallis.modules import make_policy
 from torchrl_tsallis.ratings import TsallisRating
+from torchrl_tsallis.ratings.tsallis.equations import log_mixture, rating
 
 
 def batch(*shape: int, dtype: torch.dtype = torch.float32) -> TensorDict:

@@ -25,8 +25,10 @@ GRID = ["task=[both]", "method=[bc,q_bc_0.8,adaptive_q,proposal]", "seeds=2", "b
 def recipe(monkeypatch):
     monkeypatch.syspath_prepend(str(RECIPES))
     import ant_figure3
+    import ant_sweep
 
-    return ant_figure3
+    monkeypatch.setattr(ant_sweep, "figure3", lambda cfg: ant_sweep.run(cfg, ant_figure3.wanted_of(cfg)), raising=False)
+    return ant_sweep
 
 
 def config(name: str, folder: Path, *overrides: str):
@@ -62,13 +64,13 @@ def test_killed_and_started_again_it_does_everything_once_as_single_runs_do(reci
     assert process.returncode == -signal.SIGKILL
     before = lines_of(output / "returns.csv")
     assert 4 <= len(before) < 1 + 24
-    policies = output / "std_0.2" / "both" / "seeds_00-00" / "policies.safetensors"
+    policies = output / "own" / "std_0.2" / "both" / "seeds_00-00" / "policies.safetensors"
     trained = policies.stat().st_mtime_ns
     with open(output / "returns.csv", "a") as file:
-        file.write("proposal,both,0.2,0,")  # what a kill in the middle of a line leaves
+        file.write("proposal,own,both,0.2,")  # what a kill in the middle of a line leaves
 
     cfg = config("ant_figure3", tmp_path, *GRID)
-    rows = recipe.run(cfg)
+    rows = recipe.figure3(cfg)
     assert policies.stat().st_mtime_ns == trained, "trained twice"
     after = lines_of(output / "returns.csv")
     assert after[: len(before)] == before and len(after) == 1 + 24 == 1 + len(set(after[1:]))
@@ -82,20 +84,22 @@ def test_killed_and_started_again_it_does_everything_once_as_single_runs_do(reci
     for method, seed, name in (("proposal", 1, "proposal"), ("q_bc", 0, "q_bc_0.8")):
         train_one(("both", seed, method), single)
         alone = load_file(tmp_path / "single" / "both" / f"seed_{seed}" / method / "policy.safetensors")
-        together = load_file(output / "std_0.2" / "both" / f"seeds_{seed:02d}-{seed:02d}" / "policies.safetensors")
+        together = load_file(
+            output / "own" / "std_0.2" / "both" / f"seeds_{seed:02d}-{seed:02d}" / "policies.safetensors"
+        )
         for entry, value in alone.items():
             torch.testing.assert_close(together[f"{name}/{seed}/{entry}"], value, rtol=1e-3, atol=1e-5)
 
     # More episodes are added, and returns do not depend on what was done when; nothing is left to be trained.
     cfg.evaluation.episodes = 4
-    more = recipe.run(cfg)
+    more = recipe.figure3(cfg)
     assert [row for row in more if row["episode"] < 3] == rows and len(more) == 32
     assert policies.stat().st_mtime_ns == trained
 
     with pytest.raises(SystemExit, match=r"made with other epochs: choose another output"):
-        recipe.run(config("ant_figure3", tmp_path, *GRID, "epochs=6"))
+        recipe.figure3(config("ant_figure3", tmp_path, *GRID, "epochs=6"))
     with pytest.raises(SystemExit, match="no launcher 'slurm'"):
-        recipe.run(config("ant_figure3", tmp_path, *GRID, "seeds=3", "launcher=slurm"))
+        recipe.figure3(config("ant_figure3", tmp_path, *GRID, "seeds=3", "launcher=slurm"))
 
 
 @pytest.mark.slow
@@ -103,8 +107,8 @@ def test_training_goes_on_from_a_checkpoint_to_the_same_policies(recipe, tmp_pat
     from safetensors.torch import load_file
 
     cfg = config("ant_figure3", tmp_path, "task=[clean]", "method=[bc,proposal]", "seeds=1", "evaluation.episodes=1")
-    recipe.run(cfg)
-    whole = load_file(tmp_path / "output" / "std_0.2" / "clean" / "seeds_00-00" / "policies.safetensors")
+    recipe.figure3(cfg)
+    whole = load_file(tmp_path / "output" / "own" / "std_0.2" / "clean" / "seeds_00-00" / "policies.safetensors")
     cfg.output = str(tmp_path / "killed")
     epochs = []
 
@@ -115,13 +119,13 @@ def test_training_goes_on_from_a_checkpoint_to_the_same_policies(recipe, tmp_pat
 
     monkeypatch.setattr(recipe, "tick", tick)
     with pytest.raises(SystemExit, match="the same command goes on"):
-        recipe.run(cfg)
-    folder = tmp_path / "killed" / "std_0.2" / "clean" / "seeds_00-00"
+        recipe.figure3(cfg)
+    folder = tmp_path / "killed" / "own" / "std_0.2" / "clean" / "seeds_00-00"
     assert list((folder / "checkpoints").iterdir()) and not (folder / "policies.safetensors").exists()
     epochs.clear()
     monkeypatch.setattr(recipe, "tick", epochs.append)
     monkeypatch.setattr(recipe, "tick", lambda count=1: epochs.append(count))
-    recipe.run(cfg)
+    recipe.figure3(cfg)
     assert epochs[0] >= 2, "it began anew"
     assert all(torch.equal(value, whole[name]) for name, value in load_file(folder / "policies.safetensors").items())
     assert not (folder / "checkpoints").exists()
@@ -137,8 +141,10 @@ def test_a_compiled_loss_trains_the_same_policies(recipe, tmp_path):
     for name in ("null", "{backend: aot_eager}"):  # the path of a C++ compiler or a GPU, without either
         cfg = config("ant_figure3", tmp_path, *small, f"compile={name}")
         cfg.output = str(tmp_path / name[:4])
-        recipe.run(cfg)
-        policies[name] = load_file(Path(cfg.output) / "std_0.2" / "both" / "seeds_00-00" / "policies.safetensors")
+        recipe.figure3(cfg)
+        policies[name] = load_file(
+            Path(cfg.output) / "own" / "std_0.2" / "both" / "seeds_00-00" / "policies.safetensors"
+        )
     plain, compiled = policies.values()
     for entry, value in plain.items():
         torch.testing.assert_close(compiled[entry], value, rtol=1e-3, atol=1e-5)
@@ -174,7 +180,7 @@ def test_one_command_draws_the_figure_from_the_raw_file_alone(recipe, tmp_path):
 
     generator = torch.Generator().manual_seed(0)
     rows = [
-        {"method": m, "task": t, "std": 0.2, "seed": s, "episode": e}
+        {"method": m, "trio": "own", "task": t, "std": 0.2, "scale": 1.0, "seed": s, "episode": e}
         | {"return": 1000.0 * (m == "proposal") + 100 * torch.randn((), generator=generator).item()}
         for t in ("clean", "both") for m in ("bc", "proposal") for s in range(3) for e in range(4)
     ]  # fmt: skip
@@ -225,12 +231,12 @@ def test_settings_that_changed_are_refused_and_new_options_are_not(units, tmp_pa
 
 
 def row_of(key, episode: int) -> dict:
-    return dict(zip(("method", "task", "std", "seed"), key, strict=True)) | {"episode": episode, "return": 1.0}
+    return key._asdict() | {"episode": episode, "return": 1.0}
 
 
 def test_table_loses_only_what_a_kill_cut_off(units, tmp_path):
     table = units.ReturnsTable(tmp_path / "returns.csv")
-    rows = [row_of(("bc", "both", 0.25, 3), episode) for episode in range(3)]
+    rows = [row_of(units.Key("bc", "both", 0.25, 3), episode) for episode in range(3)]
     table.append(rows)
     content = table.path.read_bytes()
     for size in range(len(content)):
@@ -240,7 +246,7 @@ def test_table_loses_only_what_a_kill_cut_off(units, tmp_path):
         table.append(rows[len(kept) :])
         assert table.path.read_bytes() == content
     table.append(rows)  # a row that is there twice counts once
-    assert table.read() == rows and table.counts() == {("bc", "both", 0.25, 3): 3}
+    assert table.read() == rows and table.counts() == {units.Key("bc", "both", 0.25, 3): 3}
     with open(table.path, newline="") as file:
         assert tuple(next(csv.reader(file))) == units.COLUMNS
 
@@ -249,7 +255,7 @@ def test_no_policy_is_in_two_units_and_none_is_left_out(units, tmp_path):
     table = units.ReturnsTable(tmp_path / "returns.csv")
 
     def wanted(seeds, methods=("bc", "proposal")):
-        return [(m, "both", 0.2, s) for s in seeds for m in methods]
+        return [units.Key(m, "both", 0.2, s) for s in seeds for m in methods]
 
     first = units.plan(wanted(range(3)), table, tmp_path, episodes=2, block=2)
     assert [unit.folder.name for unit in first] == ["seeds_00-01", "seeds_02-02"]

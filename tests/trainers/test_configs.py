@@ -14,7 +14,16 @@ from hydra import compose, initialize_config_dir
 from hydra.utils import instantiate
 from omegaconf import OmegaConf
 
-from torchrl_tsallis import AdaTerm, CATSoftUpdate, PredictiveBCLoss, QTuner, TsallisBCLoss
+from torchrl_tsallis import (
+    AdaTerm,
+    CATSoftUpdate,
+    PeakRating,
+    PredictiveBCLoss,
+    QTuner,
+    ScoreTuner,
+    TsallisBCLoss,
+    TsallisRating,
+)
 from torchrl_tsallis.data import make_replay_buffer
 from torchrl_tsallis.modules import make_policy, make_recurrent_policy
 from torchrl_tsallis.trainers import configs, make_offline_trainer
@@ -27,14 +36,24 @@ PAIRS = [
     (configs.CATSoftUpdateConfig, CATSoftUpdate, {"loss_module"}),
     (configs.AdaTermConfig, AdaTerm, {"params"}),
     (configs.QTunerConfig, QTuner, {"loss"}),
+    (configs.ScoreTunerConfig, ScoreTuner, {"loss"}),
+    (configs.TsallisRatingConfig, TsallisRating, set()),
+    (configs.PeakRatingConfig, PeakRating, set()),
     (configs.OfflineTrainerConfig, make_offline_trainer, set()),
 ]
+
+
+def defaults(target) -> dict:
+    return {k: p.default for k, p in inspect.signature(target).parameters.items() if k != "self"}
 
 
 @pytest.mark.parametrize(("config", "target", "later"), PAIRS, ids=lambda x: getattr(x, "__name__", ""))
 def test_every_argument_is_a_field_with_the_same_default(config, target, later):
     known = {f.name: f for f in fields(config) if not f.name.startswith("_")}
-    arguments = {k: p.default for k, p in inspect.signature(target).parameters.items() if k != "self"}
+    arguments = defaults(target)
+    for keywords, further in (("settings", TsallisBCLoss), ("tsallis", TsallisRating)):
+        if arguments.pop(keywords, None) is not None:  # handed on; of a rating's settings None is its own default
+            arguments |= defaults(further) if further is TsallisBCLoss else dict.fromkeys(defaults(further))
     assert set(known) - later == set(arguments) - later
     for name, default in arguments.items():
         if name in later or default is inspect.Parameter.empty:

@@ -177,8 +177,8 @@ def replace_pairs(experts: TensorDictBase, others: TensorDictBase, *, share: flo
     hit = torch.rand(experts.shape, generator=generator) < share
     drawn = torch.randint(len(others), (int(hit.sum()),), generator=generator)
     out = experts.clone()
-    for key in out.keys():
+    for key, value in out.items():
         if key != "info":
-            out[key][hit] = others[key][drawn]
+            value[hit] = others[key][drawn]
     out["info", "is_amateur"][hit] = True
     return out

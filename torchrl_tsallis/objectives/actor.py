@@ -82,7 +82,7 @@ def get_dist(actor: ProbabilisticTensorDictSequential, inputs: TensorDictBase) -
 
 
 @contextmanager
-def _named_inputs(actor: nn.Module, inputs: TensorDictBase) -> Iterator[None]:
+def _named_inputs(actor: Any, inputs: TensorDictBase) -> Iterator[None]:
     """Says what a network was given that it could not take: torch only speaks of matrices.
 
     Raises:

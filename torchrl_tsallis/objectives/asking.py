@@ -61,12 +61,21 @@ class AskedLoss:
     @property
     def q(self) -> Tensor:
         """Tsallis index of the rating, a scalar, or ``[S]`` with members; setting it writes into the rating."""
-        return self.rating_module.q
+        return self._q
 
     @q.setter
     def q(self, value: float | Tensor) -> None:
         with torch.no_grad():
-            self.rating_module.q.copy_(torch.as_tensor(value))
+            self._q.copy_(torch.as_tensor(value))
+
+    @property
+    def _q(self) -> Tensor:
+        q = getattr(self.rating_module, "q", None)
+        if not isinstance(q, Tensor):
+            raise AttributeError(
+                f"{type(self.rating_module).__name__} has no q; see the settings of loss.rating_module"
+            )
+        return q
 
     @property
     def target_members(self) -> Tensor | None:

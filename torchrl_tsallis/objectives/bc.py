@@ -223,7 +223,10 @@ class TsallisBCLoss(AskedLoss, LossModule):
         """What the rating is given: one pass of the network, and one of the target's where the rating asks for it."""
         mask, key = mask_of(self, tensordict), self.tensor_keys.action
         batch = self.batch_of(mask, sync)
-        inputs = select_inputs(tensordict, self.actor_network, self.in_keys, members=self.num_members, mask=mask)
+        dtype = next((p.dtype for p in self.actor_network_params.parameters() if p.is_floating_point()), None)
+        inputs = select_inputs(
+            tensordict, self.actor_network, self.in_keys, members=self.num_members, mask=mask, dtype=dtype
+        )
         dist, written = self._pass(inputs, self.actor_network_params)
         action, log_prob = inputs.get(key), log_prob_of(dist, inputs, key)
         likelihood = self.rating_module.likelihood(log_prob, dist, action, batch)

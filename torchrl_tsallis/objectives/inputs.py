@@ -91,6 +91,7 @@ def select_inputs(
     *,
     members: int | None = None,
     mask: Tensor | None = None,
+    dtype: torch.dtype | None = None,
 ) -> TensorDictBase:
     """Selects the action and the actor's inputs, checked; the caller's tensordict is never written to.
 
@@ -100,6 +101,7 @@ def select_inputs(
         in_keys: the action's key first, then the actor's inputs.
         members: S, the number of stacked members, if there are any.
         mask: valid samples, ``[*B]``; what the others hold is replaced by zeros.
+        dtype: of the actor's parameters. Default: None, the action may be of any.
 
     Returns:
         A tensordict with ``in_keys``; a recurrent actor's state is there only if the batch holds it.
@@ -126,16 +128,15 @@ def select_inputs(
     action = inputs.get(in_keys[0])
     if 0 in tensordict.shape or 0 in action.shape:
         raise ValueError(
-            f"the batch of shape {list(tensordict.shape)}, actions {list(action.shape)}, is empty: pass at least one sample"
+            f"the batch of shape {list(tensordict.shape)}, actions {list(action.shape)}, is empty: "
+            "pass at least one sample"
         )
     if mask is not None:
         # Padding may hold NaN, which would reach the weights' gradients through 0 * NaN in the network.
         inputs = inputs.apply(lambda x: x.where(expand_right(mask, x.shape), torch.zeros_like(x)))
-    if not is_tensor_collection(action) and action.is_floating_point():
-        wanted = next((p.dtype for p in actor.parameters() if p.is_floating_point()), action.dtype)
-        if action.dtype != wanted:
-            raise TypeError(
-                f"{in_keys[0]!r} is {action.dtype}, the actor's parameters are {wanted}: "
-                "convert the data to their type, for instance by tensordict.float()"
-            )
+    if not is_tensor_collection(action) and action.is_floating_point() and action.dtype != (dtype or action.dtype):
+        raise TypeError(
+            f"{in_keys[0]!r} is {action.dtype}, the actor's parameters are {dtype}: "
+            "convert the data to their type, for instance by tensordict.float()"
+        )
     return inputs

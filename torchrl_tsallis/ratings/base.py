@@ -156,8 +156,8 @@ class Rating(nn.Module):
             value = getattr(self, name)
             if value.ndim and len(value) != num_members:
                 raise ValueError(
-                    f"{name} has {len(value)} values for {num_members or 1} policies: give a number or one of each, and "
-                    "each loss a rating of its own"
+                    f"{name} has {len(value)} values for {num_members or 1} policies: give a number or one of each, "
+                    "and each loss a rating of its own"
                 )
             if num_members is not None and not value.ndim:
                 setattr(self, name, value.repeat(num_members))
@@ -182,8 +182,8 @@ class Rating(nn.Module):
         normal = diagonal_normal(dist, action)
         if normal is None:
             raise ValueError(
-                f"beta > 0 needs a distribution with location and scale, the actor's is a {type(dist).__name__}: give the "
-                "rating beta=0"
+                f"beta > 0 needs a distribution with location and scale, the actor's is a {type(dist).__name__}: "
+                "give the rating beta=0"
             )
         return scale_weighted_log_prob(normal, batch.spread(self.beta.to(normal.loc), normal.loc))
 
@@ -244,15 +244,12 @@ def as_numbers(name: str, value: Any, low: float, high: float) -> float | list[f
         ...
         ValueError: q must be a number in [0, 1], or a sequence of one for each stacked member, got None
     """
-    plain = value.tolist() if isinstance(value, Tensor) else value
+    plain: Any = value.tolist() if isinstance(value, Tensor) else value
     many = isinstance(plain, Sequence) and not isinstance(plain, str)
-    numbers = list(plain) if many else [plain]
-    for number in numbers:
-        if isinstance(number, bool) or not isinstance(number, Real) or not low <= number <= high:
-            break
-    else:
-        if numbers:
-            return [float(number) for number in numbers] if many else float(plain)
+    numbers: list[Any] = list(plain) if many else [plain]
+    valid = [isinstance(x, Real) and not isinstance(x, bool) and low <= float(x) <= high for x in numbers]
+    if numbers and all(valid):
+        return [float(x) for x in numbers] if many else float(plain)
     raise ValueError(
         f"{name} must be a number in [{low:g}, {high:g}], or a sequence of one for each stacked member, got {value!r}"
     )

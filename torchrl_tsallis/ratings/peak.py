@@ -77,11 +77,11 @@ class PeakRating(Rating):
 
     .. math:: \rho = \left(\frac{\pi(a|s)}{\max_{a'} \pi(a'|s)}\right)^u = e^{-u Z / 2}
 
-    The second form is that of a diagonal normal with the squared standardised distance Z, also under a bijection such as
-    tanh, in whose base space the peak is meant. The rating is in (0, 1] and has no unit: it is the same for actions in
-    metres and in millimetres. Neither a target network nor gamma is needed. The gradient of the loss is the rating times
-    that of the negative log-likelihood, mean and scale; its fixed point keeps the fitted variance at 1 - u of a true
-    normal's, so that the scale neither collapses nor explodes.
+    The second form is that of a diagonal normal with the squared standardised distance Z, also under a bijection such
+    as tanh, in whose base space the peak is meant. The rating is in (0, 1] and has no unit: it is the same for actions
+    in metres and in millimetres. Neither a target network nor gamma is needed. The gradient of the loss is the rating
+    times that of the negative log-likelihood, mean and scale; its fixed point keeps the fitted variance at 1 - u of a
+    true normal's, so that the scale neither collapses nor explodes.
 
     ======  ========  =======  ==============================================
     symbol  argument  default  source
@@ -92,9 +92,9 @@ class PeakRating(Rating):
 
     **While the scale does not fit**, as in the first steps on actions of another size than the network's first outputs,
     all samples are many scales away, and a rating of Z would reject the lot. The typical distance of a dimension,
-    :math:`T = 1 / \mathbb{E}[1 / (1 + Z/A)] - 1`, which outliers hardly move, tells this from noise: where T is over 2,
-    Z is divided by T / 2. On fitted data T is about 0.9, and it stays under 2 with up to a third of gross outliers. As a
-    statistic of the batch its running mean is used in ``eval()``.
+    :math:`T = 1 / \mathbb{E}[1 / (1 + Z/A)] - 1`, which outliers hardly move, tells this from noise: where T is over
+    2, Z is divided by T / 2. On fitted data T is about 0.9, and it stays under 2 with up to a third of gross outliers.
+    As a statistic of the batch its running mean is used in ``eval()``.
 
     Logs ``u`` and ``distance`` (T; 0 for other distributions). Tuned by :class:`~torchrl_tsallis.ScoreTuner`. For
     distributions other than diagonal normals Z is minus twice the logarithm of the density ratio; u is fixed then, and

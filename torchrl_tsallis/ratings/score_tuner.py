@@ -85,7 +85,8 @@ class ScoreTuner(RatingTuner):
 
     On normal data without outliers H rises with u, so that u runs to 0 and nothing is rejected without need. With gross
     outliers u settles where they just no longer count. There is no level, no multiplier and no bound that matters.
-    Used as :class:`~torchrl_tsallis.QTuner` is: ``tuner.register(trainer)``, or ``tuner.step()`` after the policy's step.
+    Used as :class:`~torchrl_tsallis.QTuner` is: ``tuner.register(trainer)``, or ``tuner.step()`` after the policy's
+    step.
 
     =========  ========  =======  ========
     symbol     argument  default  source

@@ -94,6 +94,11 @@ class TsallisBCLossConfig(LossConfig):
 
     actor_network: Any = None
     rating: Any = None
+    q: Any = None  # these five: TsallisRating's own defaults
+    gamma_mix: Any = None
+    gamma_min: float | None = None
+    gamma_max: float | None = None
+    beta: Any = None
     reduction: str | None = None
     sync_stats: bool = True
     process_group: Any = None
@@ -228,14 +233,15 @@ class OfflineTrainerConfig(ConfigBase):
         """Nothing to check: the factory does."""
 
 
-def make_loss(actor_network: Any, **settings: Any) -> TsallisBCLoss:
+def make_loss(actor_network: Any, loss_class: type[TsallisBCLoss] = TsallisBCLoss, **settings: Any) -> TsallisBCLoss:
     """Builds the loss; the actor may come as a partial, as TorchRL's model configurations give it."""
-    return TsallisBCLoss(actor_network() if isinstance(actor_network, partial) else actor_network, **settings)
+    given = {name: value for name, value in settings.items() if value is not None}
+    return loss_class(actor_network() if isinstance(actor_network, partial) else actor_network, **given)
 
 
-def make_predictive_loss(actor_network: Any, **settings: Any) -> PredictiveBCLoss:
+def make_predictive_loss(actor_network: Any, **settings: Any) -> TsallisBCLoss:
     """Builds the loss with the prediction; the actor may come as a partial."""
-    return PredictiveBCLoss(actor_network() if isinstance(actor_network, partial) else actor_network, **settings)
+    return make_loss(actor_network, PredictiveBCLoss, **settings)
 
 
 def make_trainer(

@@ -174,7 +174,9 @@ def make_offline_trainer(
     clip_norm: float | None = None,
     progress: bool = True,
 ) -> Trainer:
-    """Assembles TorchRL's trainer for a fixed data set. After each optimizer step the target follows, then the rating is tuned.
+    """Assembles TorchRL's trainer for a fixed data set.
+
+    After each optimizer step the target follows, then the rating is tuned.
 
     Args:
         loss: the loss, as ``TsallisBCLoss``.
