@@ -118,3 +118,19 @@ def test_errors():
         QTuner(make_loss(), q_min=1.0)
     with pytest.raises(ValueError, match="multiplier"):
         QTuner(make_loss(), multiplier=-1.0)
+
+
+@pytest.mark.parametrize("away", [1e-3, 1e-5, 1e-7, 1e-9])
+@pytest.mark.parametrize("shift", [-3.0, 2.0])
+def test_the_sign_is_right_however_close_q_is_to_one(away, shift):
+    log_prob = shift + torch.linspace(-1, 1, 11, dtype=torch.float64)
+    phi = torch.logit(torch.tensor(1 - away / 0.4, dtype=torch.float64))
+    exact = q_gradient(log_prob, phi, gamma=0.0)
+    value, slope = q_gradient(log_prob.float(), phi.float(), gamma=0.0)
+    torch.testing.assert_close(slope.double(), exact[1], rtol=2e-2, atol=0)
+    assert slope.sign() == exact[1].sign()
+
+
+def test_densities_of_zero_are_no_trouble():
+    value, slope = q_gradient(torch.tensor([-math.inf, 0.0, 1.0]), torch.tensor(0.0))
+    assert value.isfinite() and slope.isfinite()

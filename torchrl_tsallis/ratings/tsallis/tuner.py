@@ -18,6 +18,9 @@ from torchrl_tsallis.ratings.tuner import MakeOptimizer, RatingTuner
 if TYPE_CHECKING:
     from torchrl_tsallis.objectives.bc import TsallisBCLoss
 
+#: Log-densities are cut here: times a density of 0 they must give 0.
+_LEAST = -1e30
+
 
 def q_of_phi(phi: Tensor, q_min: float = 0.6) -> Tensor:
     """Maps the q tuner's free parameter to q in (q_min, 1) (eq. 15).
@@ -111,6 +114,7 @@ def q_gradient(
     batch = batch or Batch(members=bool(phi.ndim))
     with torch.no_grad():
         u = (-phi).sigmoid().mul_(1 - q_min)  # 1 - q, right to the last digit also where q is 1 but for that
+        log_prob = log_prob.clamp(min=_LEAST)
         exponent = batch.spread(u, log_prob) * log_prob
         capped = exponent.clamp(max=MAX_EXPONENT)
         slopes = (capped.exp() * log_prob).where(exponent <= MAX_EXPONENT, 0.0)
