@@ -11,8 +11,8 @@ from torch import Tensor
 from torchrl.objectives.common import LossModule
 from torchrl.objectives.utils import TargetNetUpdater
 
-from torchrl_tsallis._segments import Segments
-from torchrl_tsallis._student_t import floor_target, robust_rate
+from torchrl_tsallis.optim.segments import Segments
+from torchrl_tsallis.optim.student_t import floor_target, robust_rate
 
 __all__ = ["CATSoftUpdate"]
 
@@ -29,7 +29,7 @@ class CATSoftUpdate(TargetNetUpdater):
         thetabar += t (theta - thetabar);  v += t (d2 + max(eps^2, (d2 - D v) / nu) - v);  nu += t_nu (nu* - nu)
         theta -= strength (tau - t) (theta - thetabar_before)
 
-    ``t_nu`` and ``nu*`` are those of :func:`torchrl_tsallis._student_t.robust_rate` with rate ``tau``. Leading
+    ``t_nu`` and ``nu*`` are those of :func:`torchrl_tsallis.optim.student_t.robust_rate` with rate ``tau``. Leading
     dimensions of stacked (ensemble) parameters have scalars of their own, and a member that the loss's
     ``target_members`` leaves out is not pulled. ``k=inf, strength=0`` is torchrl's
     ``SoftUpdate(tau=tau)``. A loss without target parameters is accepted; nothing is updated then. Call
