@@ -74,7 +74,7 @@ def test_single_step_by_hand(strength):
     assert theta.item() == pytest.approx(1 - strength * (0.4 - t), rel=1e-12)
     state = updater.state_dict()["cat"]["target_net_params"]
     w, largest = 2.5 / 5.5, 2.5 / 1.5
-    w_nu, bound = w - math.log(w), -math.log(torch.finfo(torch.float64).tiny)
+    w_nu, bound = w - math.log(w), 126 * math.log(2)  # 2^-126: the smallest normal float32
     star = (3.5 / 2.5 + 1.5) / w_nu * (1 - 1 / 1.5) + 1.5
     assert largest - math.log(largest) < bound
     assert next(iter(state["nu"].values())).item() == pytest.approx(1.5 + 0.4 * w_nu / bound * (star - 1.5), rel=1e-12)
@@ -156,8 +156,14 @@ def test_first_scale_waits_for_a_difference():
     _move(loss, 0, 0)
     before = [x.clone() for x in _leaves(loss.target_net_params)]
     updater.step()
-    # D = 1 and nu = 1 + eps: the share is nu / (nu + 1)
-    share = (1 + 1e-5) / (2 + 1e-5)
+    # The first step had D = 0 and nu = 1 + eps, so that w = w_max; it moved nu a little, by the equations.
+    nu = 1 + 1e-5
+    w = (nu + 1) / nu
+    w_nu = w - math.log(w)
+    star = ((nu + 2) / (nu + 1) + nu) / w_nu * (1 - 1 / nu) + 1 + 1e-5
+    nu += 0.1 * w_nu / (126 * math.log(2)) * (star - nu)
+    # Then D = 1: the share is nu / (nu + 1).
+    share = nu / (nu + 1)
     rows = zip(before, _leaves(loss.target_net_params), _leaves(loss.net_params), strict=True)
     for old, new, theta in rows:
         torch.testing.assert_close(new, old + 0.1 * share * (theta - old), rtol=1e-10, atol=1e-14)
