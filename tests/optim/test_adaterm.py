@@ -66,7 +66,8 @@ def _run(optim, params, grads):
 OPTIONS = [
     {}, {"weight_decay": 0.1}, {"amsgrad": 0.9}, {"amsgrad": 1.0}, {"uncentered": True}, {"adaptive_bias": True},
     {"amsgrad": 0.9, "uncentered": True}, {"ini_dof": 5.0}, {"ini_dof": 1.0}, {"betas": (0.9, 0.9, 1.0)},
-    {"k": 4.0, "ini_dof": 4.0, "betas": (0.9, 0.9, 1.0)}, {"k": math.inf}, {"k": 3.0, "betas": (0.8, 0.99, 0.5), "eps": 1e-3, "lr": 0.1},
+    {"k": 4.0, "ini_dof": 4.0, "betas": (0.9, 0.9, 1.0)}, {"k": math.inf},
+    {"k": 3.0, "betas": (0.8, 0.99, 0.5), "eps": 1e-3, "lr": 0.1},
     {"skip_nonfinite": False},
 ]  # fmt: skip
 
@@ -193,7 +194,9 @@ def test_infinity_is_refused_except_for_k(name):
         AdaTerm([torch.nn.Parameter(torch.ones(2))], **{name: math.inf})
 
 
-@pytest.mark.parametrize("value", [None, 0.9, "0.9", 3, (0.9, None, 0.9), (0.9, 0.9, True), (0.9, math.nan, 0.9)], ids=str)
+@pytest.mark.parametrize(
+    "value", [None, 0.9, "0.9", 3, (0.9, None, 0.9), (0.9, 0.9, True), (0.9, math.nan, 0.9)], ids=str
+)
 def test_betas_are_three_numbers(value):
     with pytest.raises((TypeError, ValueError), match="^betas"):
         AdaTerm([torch.nn.Parameter(torch.ones(2))], betas=value)

@@ -3,22 +3,32 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
+import torch
 from tensordict.nn import TensorDictModule
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
 from torchrl.modules import IndependentNormal, ProbabilisticActor
 
+from torchrl_tsallis._checks import check_number
 from torchrl_tsallis.modules.activations import Squish, squareplus
 from torchrl_tsallis.modules.linear import Linear
 from torchrl_tsallis.modules.norm import RMSNorm
+from torchrl_tsallis.modules.numerics import is_traced, widened
 
 
 class NormalHead(nn.Module):
     """Splits the network's output into mean and positive scale of a diagonal normal.
 
+    Under autocast both are float32: a density in the three digits of bfloat16 would be off by percents.
+
     Args:
         min_scale: added to the squareplus of the raw scale; 0 as in the paper.
+
+    Raises:
+        TypeError: for a ``min_scale`` that is no number.
+        ValueError: for one that is negative or not finite, and for an output of odd length.
 
     Examples:
         >>> import torch
@@ -31,12 +41,34 @@ class NormalHead(nn.Module):
 
     def __init__(self, min_scale: float = 0.0) -> None:
         super().__init__()
-        self.min_scale = min_scale
+        self.min_scale = check_number("min_scale", min_scale, low=0)
 
     def forward(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """Maps ``[*B, 2A]`` to mean ``[*B, A]`` and scale ``[*B, A]``."""
+        if not is_traced() and x.shape[-1] % 2:
+            raise ValueError(
+                f"the network's output has shape {list(x.shape)}: its last dimension must be 2 x the action's, for "
+                "mean and scale"
+            )
+        if torch.is_autocast_enabled(x.device.type):
+            x = widened(x)
         loc, raw = x.chunk(2, -1)
         return loc, squareplus(raw) + self.min_scale
+
+
+def check_dims(**dims: Any) -> None:
+    """Raises TypeError for a dimension that is no integer, and ValueError for one that is not positive."""
+    if min(check_number(name, value, integer=True) for name, value in dims.items()) < 1:
+        raise ValueError(f"every dimension must be positive, got {', '.join(f'{n}={v}' for n, v in dims.items())}")
+
+
+def check_key(name: str, key: Any) -> None:
+    """Raises TypeError or ValueError for what is no key of a tensordict."""
+    parts = key if isinstance(key, tuple) else (key,)
+    if not all(isinstance(part, str) for part in parts):
+        raise TypeError(f"{name} must be a key of a tensordict, a string or a tuple of them, got {key!r}")
+    if not parts or "" in parts:
+        raise ValueError(f"{name} must be a key of a tensordict, got the empty {key!r}")
 
 
 def make_policy(
@@ -61,7 +93,8 @@ def make_policy(
         An actor that writes ``loc``, ``scale`` and the action.
 
     Raises:
-        ValueError: if a dimension is not positive.
+        TypeError: for a dimension that is no integer, hidden widths that are no sequence, or a key that is none.
+        ValueError: if a dimension is not positive, or a key is empty.
 
     Examples:
         >>> import torch
@@ -69,13 +102,16 @@ def make_policy(
         >>> make_policy(28, 8)(TensorDict({"observation": torch.zeros(3, 28)}, [3]))["action"].shape
         torch.Size([3, 8])
     """
-    sizes = [obs_dim, *hidden]
-    if min(*sizes, action_dim) < 1:
-        raise ValueError(f"every dimension must be positive, got {obs_dim=}, {action_dim=}, {hidden=}")
+    if isinstance(hidden, str) or not isinstance(hidden, Sequence):
+        raise TypeError(f"hidden must be a sequence of widths, one a hidden layer, got {hidden!r}")
+    check_dims(obs_dim=obs_dim, **{f"hidden[{i}]": n for i, n in enumerate(hidden)}, action_dim=action_dim)
+    sizes = [int(n) for n in (obs_dim, *hidden)]
+    check_key("observation_key", observation_key)
+    check_key("action_key", action_key)
     layers: list[nn.Module] = []
     for n_in, n_out in zip(sizes[:-1], sizes[1:], strict=True):
         layers += [Linear(n_in, n_out), RMSNorm(n_out), Squish()]
-    network = nn.Sequential(*layers, Linear(sizes[-1], 2 * action_dim), NormalHead())
+    network = nn.Sequential(*layers, Linear(sizes[-1], 2 * int(action_dim)), NormalHead())
     return ProbabilisticActor(
         TensorDictModule(network, in_keys=[observation_key], out_keys=["loc", "scale"]),
         in_keys=["loc", "scale"],

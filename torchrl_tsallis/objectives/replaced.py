@@ -1,4 +1,4 @@
-"""Whether parameters were replaced by others, as no step of an optimizer does: loads are noticed before they do harm."""
+"""Whether parameters were replaced by others, as no step of an optimizer does."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import weakref
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
-import torch
 from torch import Tensor, nn
 
 from torchrl_tsallis.optim.segments import Segments
@@ -78,9 +77,9 @@ class LoadWatch:
         self.before, self.after = before, after
         self.outermost: int | None = None
         handles = []
-        for module in {id(part): part for module in modules for part in module.modules()}.values():
-            handles.append(module.register_load_state_dict_pre_hook(_Hook(self, "_before")))
-            handles.append(module.register_load_state_dict_post_hook(_Hook(self, "_after")))
+        for part in {id(part): part for module in modules for part in module.modules()}.values():
+            handles.append(part.register_load_state_dict_pre_hook(_Hook(self, "_before")))
+            handles.append(part.register_load_state_dict_post_hook(_Hook(self, "_after")))
         weakref.finalize(self, _remove, handles).atexit = False
 
     def _before(self, module: nn.Module, state_dict: dict[str, Any], prefix: str, *_: Any) -> None:
