@@ -179,6 +179,89 @@ def test_without_target_nothing_happens():
         assert torch.equal(a, b)
 
 
+class _Twice(torch.nn.Module):
+    """A layer under as many names as asked for; the same function whatever the number."""
+
+    def __init__(self, names):
+        super().__init__()
+        self.a = torch.nn.Linear(3, 3)
+        for name in names:
+            setattr(self, name, self.a)
+        self.z = torch.nn.Linear(3, 2)
+
+    def forward(self, x):
+        return self.z(getattr(self, "m", self.a)(self.a(x)))
+
+
+@pytest.mark.parametrize("names", [["m"], ["Z"], ["b", "m", "n"]], ids=str)
+def test_a_parameter_of_several_names_is_updated_once(names):
+    losses = []
+    for more in ([], names):
+        torch.manual_seed(0)
+        losses.append(_Loss(TensorDictModule(_Twice(more), in_keys=["x"], out_keys=["y"]).double()))
+    updaters = [CATSoftUpdate(loss) for loss in losses]
+    for step in range(10):
+        for loss, updater in zip(losses, updaters, strict=True):
+            generator = torch.Generator().manual_seed(step)
+            for p in loss.parameters():
+                p.data.add_(0.01 * torch.randn(p.shape, generator=generator, dtype=p.dtype))
+            updater.step()
+    one, several = losses
+    for params in ("net_params", "target_net_params"):
+        for name in ("a", *names):
+            for leaf in ("weight", "bias"):
+                expected = getattr(one, params).get(("module", "a", leaf))
+                assert torch.equal(getattr(several, params).get(("module", name, leaf)), expected)
+        for leaf in ("weight", "bias"):
+            keys = ("module", "z", leaf)
+            assert torch.equal(getattr(several, params).get(keys), getattr(one, params).get(keys))
+    resumed = CATSoftUpdate(several)
+    resumed.load_state_dict(updaters[1].state_dict())
+
+
+def test_members_that_the_loss_leaves_out_are_not_pulled():
+    loss = _Loss([_net(0), _net(1), _net(2)])
+    loss.target_members = torch.tensor([True, False, True])
+    updater = CATSoftUpdate(loss)
+    for p in loss.parameters():
+        p.data.add_(0.01 * torch.randn_like(p))
+    before = [x.clone() for x in _leaves(loss.net_params)]
+    updater.step()
+    moved = [not torch.equal(x[k], y[k]) for k in range(3) for x, y in [(_leaves(loss.net_params)[0], before[0])]]
+    assert moved == [True, False, True]
+
+
+NUMBERS = ("tau", "strength", "eps", "k")
+
+
+@pytest.mark.parametrize("value", [None, True, "1", math.nan, -math.inf, -1, [], [0.1, 0.2], 1j], ids=str)
+@pytest.mark.parametrize("name", NUMBERS)
+def test_every_number_is_checked(name, value):
+    with pytest.raises((TypeError, ValueError), match=f"^{name} must be"):
+        CATSoftUpdate(_Loss(_net()), **{name: value})
+
+
+@pytest.mark.parametrize("name", NUMBERS)
+def test_infinity_is_for_k_alone(name):
+    if name == "k":
+        CATSoftUpdate(_Loss(_net()), k=math.inf)
+        return
+    with pytest.raises(ValueError, match=f"^{name} must be"):
+        CATSoftUpdate(_Loss(_net()), **{name: math.inf})
+
+
+@pytest.mark.parametrize("loss", [None, torch.nn.Linear(2, 2), "loss", []], ids=lambda x: type(x).__name__)
+def test_what_is_no_loss_is_named(loss):
+    with pytest.raises(TypeError, match="^loss_module must be a loss"):
+        CATSoftUpdate(loss)
+
+
+@pytest.mark.parametrize("value", [None, "first ", 1, True])
+def test_a_start_of_the_scale_that_does_not_exist_is_named(value):
+    with pytest.raises(ValueError, match="init_scale must be 'first' or 'eps'"):
+        CATSoftUpdate(_Loss(_net()), init_scale=value)
+
+
 @pytest.mark.parametrize(
     "options", [{"tau": 2.0}, {"strength": -1.0}, {"eps": 0.0}, {"k": 0.0}, {"init_scale": "x"}], ids=str
 )

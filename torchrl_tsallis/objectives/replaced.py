@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from torchrl_tsallis.optim.segments import Segments
 
-_RELATED = 0.5  # least correlation of a tensor with what it was
+_RELATED = 0.3  # least correlation of a tensor with what it was
 
 
 def replaced_members(segments: Segments, new: Sequence[Tensor], old: Sequence[Tensor]) -> Tensor:
@@ -19,7 +19,7 @@ def replaced_members(segments: Segments, new: Sequence[Tensor], old: Sequence[Te
     Steps of an optimizer leave parameters that resemble what they were, while two trained networks are no more alike
     than random numbers. With x and y the new and old entries of a tensor about their means, the correlation
     ``2 E[x y] / (E[x^2] + E[y^2])`` is near 1 in the first case and near 0 in the second. A member is replaced
-    where it is under a half for at least half of all entries. Tensors of equal entries, such as biases of zero and
+    where it is under 0.3 for at least half of all entries. Tensors of equal entries, such as biases of zero and
     weights of a new normalisation layer, do not count.
 
     Args:
@@ -31,6 +31,7 @@ def replaced_members(segments: Segments, new: Sequence[Tensor], old: Sequence[Te
         ``[prod(B)]`` bool.
 
     Examples:
+        >>> import torch
         >>> old = [torch.linspace(-1.0, 1.0, 50)]
         >>> replaced_members(Segments(old), [old[0] + 1.0], old), replaced_members(Segments(old), [old[0].sin()], old)
         (tensor([False]), tensor([False]))
