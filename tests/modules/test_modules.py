@@ -180,6 +180,8 @@ DIMENSIONS = {
     "make_recurrent_policy.num_layers": lambda n: make_recurrent_policy(3, 2, num_layers=n),
     "NoisyLSTM.hidden_size": lambda n: NoisyLSTM(3, n),
     "RMSNorm.size": lambda n: RMSNorm(n),
+    "Linear.in_features": lambda n: Linear(n, 2),
+    "Linear.out_features": lambda n: Linear(2, n),
 }
 
 

@@ -255,6 +255,21 @@ def test_what_is_not_trained_reaches_the_target_too():
     assert torch.equal(target["target_actor_network_params.module.0.module.mean"], torch.ones(3))
 
 
+def test_a_load_after_a_change_of_the_data_type_is_followed(messages):
+    actor = make_actor(0)
+    loss = TsallisBCLoss(actor)
+    updater = CATSoftUpdate(loss)
+    updater.step()
+    loss.double()
+    state = {name: x.double() for name, x in make_actor(1).state_dict().items()}
+    actor.load_state_dict(state)
+    updater.step()
+    target = tensors(loss)
+    for name, x in state.items():
+        assert torch.equal(target[f"target_actor_network_params.{name}"], x), name
+    assert len(messages) == 1
+
+
 def test_parameters_that_are_exchanged_for_others_are_named(messages):
     actor = make_actor(0)
     loss = TsallisBCLoss(actor)

@@ -255,3 +255,17 @@ def test_the_floor_is_added_after_the_maximum():
     # m = 0.1, c1 = 0.1; s = 0.1, c2 = 0.1: 1 / sqrt((0.1 + 1) / 0.1)
     assert p.item() == pytest.approx(-1 / math.sqrt(11.0), rel=1e-12)
     assert optim.state[p]["max_exp_avg_sq"].item() == pytest.approx(0.1, rel=1e-12)
+
+
+def test_a_state_that_does_not_fit_says_what_it_is_of():
+    layer, other = torch.nn.Linear(2, 1), torch.nn.Linear(3, 1)
+    optim = AdaTerm(layer.parameters())
+    with pytest.raises(ValueError, match="another optimizer than AdaTerm: no 'batch_dims' in its groups"):
+        optim.load_state_dict(torch.optim.Adam(layer.parameters(), betas=(0.9, 0.9)).state_dict())
+    filled = AdaTerm(other.parameters())
+    other(torch.ones(3)).sum().backward()
+    filled.step()
+    optim.load_state_dict(filled.state_dict())
+    layer(torch.ones(2)).sum().backward()
+    with pytest.raises(ValueError, match=r"'exp_avg' has shape \(1, 3\).*\(1, 2\).*another network"):
+        optim.step()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import torch
 from tensordict.nn import TensorDictModule
@@ -16,6 +15,7 @@ from torchrl_tsallis.modules.activations import Squish, squareplus
 from torchrl_tsallis.modules.linear import Linear
 from torchrl_tsallis.modules.norm import RMSNorm
 from torchrl_tsallis.modules.numerics import is_traced, widened
+from torchrl_tsallis.modules.settings import check_dims, check_key
 
 
 class NormalHead(nn.Module):
@@ -56,21 +56,6 @@ class NormalHead(nn.Module):
         return loc, squareplus(raw) + self.min_scale
 
 
-def check_dims(**dims: Any) -> None:
-    """Raises TypeError for a dimension that is no integer, and ValueError for one that is not positive."""
-    if min(check_number(name, value, integer=True) for name, value in dims.items()) < 1:
-        raise ValueError(f"every dimension must be positive, got {', '.join(f'{n}={v}' for n, v in dims.items())}")
-
-
-def check_key(name: str, key: Any) -> None:
-    """Raises TypeError or ValueError for what is no key of a tensordict."""
-    parts = key if isinstance(key, tuple) else (key,)
-    if not all(isinstance(part, str) for part in parts):
-        raise TypeError(f"{name} must be a key of a tensordict, a string or a tuple of them, got {key!r}")
-    if not parts or "" in parts:
-        raise ValueError(f"{name} must be a key of a tensordict, got the empty {key!r}")
-
-
 def make_policy(
     obs_dim: int,
     action_dim: int,
@@ -80,6 +65,9 @@ def make_policy(
     action_key: NestedKey = "action",
 ) -> ProbabilisticActor:
     """Builds the imitator of section V-B: hidden layers with RMSNorm and Squish, and a diagonal normal.
+
+    Its network, ``actor.module[0].module``, maps the observation to mean and scale, and is what ``torch.export``, the
+    ONNX exporters and ``torch.jit.trace`` take for a robot without Python.
 
     Args:
         obs_dim: dimension of the observation.

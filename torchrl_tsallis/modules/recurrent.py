@@ -10,7 +10,8 @@ from torch.nn.utils.rnn import PackedSequence
 from torchrl.modules import IndependentNormal, LSTMModule, ProbabilisticActor
 
 from torchrl_tsallis._checks import check_number
-from torchrl_tsallis.modules.policy import NormalHead, check_dims, check_key
+from torchrl_tsallis.modules.policy import NormalHead
+from torchrl_tsallis.modules.settings import check_dims, check_key
 
 State = tuple[Tensor, Tensor]
 

@@ -131,14 +131,13 @@ class CATGroup:
         if not self.buffers or scale.dtype != self.target[0].dtype or scale.device != self.target[0].device:
             self._follow_type(members)
         seg, eps, d = self.segments, self.eps, self._difference()
-        d2 = d.square().clamp_(max=torch.finfo(d.dtype).max / 16)
-        replaced = None
+        limit = torch.finfo(d.dtype).max / 16
+        d2 = d.square().clamp_(max=limit)
         first = self.waiting and self._start_scale(d2)
         distance = seg.mean(d2 / self.state["scale"])
-        if first or self._is_far(distance, d2):
-            replaced = self._restart_replaced()
+        replaced = self._restart_replaced() if first or self._is_far(distance, d2) else None
         if replaced is not None:
-            d2 = self._difference().square().clamp_(max=torch.finfo(d.dtype).max / 16)
+            d2 = self._difference().square().clamp_(max=limit)
             self._start_scale(d2)
             distance = seg.mean(d2 / self.state["scale"])
         v, nu = self.state["scale"], self.state["nu"]

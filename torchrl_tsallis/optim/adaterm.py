@@ -107,6 +107,23 @@ class AdaTerm(Optimizer):
             raise
         self._layouts.clear()
 
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Loads a state of this optimizer.
+
+        Args:
+            state_dict: of an ``AdaTerm`` of as many parameters.
+
+        Raises:
+            ValueError: if it is of another optimizer, or its groups do not fit.
+        """
+        for group in state_dict.get("param_groups", ()):
+            missing = [name for name in self.defaults if name not in group]
+            if missing:
+                raise ValueError(
+                    f"the state dict is of another optimizer than AdaTerm: its groups have no {missing[0]!r}"
+                )
+        super().load_state_dict(state_dict)
+
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Restores a pickled or loaded state; the flat vectors are rebuilt at the next step."""
         super().__setstate__(state)
@@ -164,10 +181,15 @@ class _Layout:
         vectors |= {"max_exp_avg_sq": 0.0} if group["amsgrad"] else {}
         for name, start in {**scalars, **vectors}.items():
             shapes = self.segments.batch_shapes if name in scalars else self.segments.shapes
-            parts = [
-                state[p][name].to(p) if name in state[p] else p.new_full(shape, start)
-                for p, shape in zip(params, shapes, strict=True)
-            ]
+            parts = []
+            for p, shape in zip(params, shapes, strict=True):
+                part = state[p][name].to(p) if name in state[p] else p.new_full(shape, start)
+                if part.shape != shape:
+                    raise ValueError(
+                        f"the optimizer's state {name!r} has shape {tuple(part.shape)}, its parameter of shape "
+                        f"{tuple(p.shape)} needs {tuple(shape)}: the state dict is of another network"
+                    )
+                parts.append(part)
             flat = self.segments.flatten(parts)
             self.flat[name] = flat
             views = self.segments.scalar_views(flat) if name in scalars else self.segments.views(flat)
