@@ -30,6 +30,7 @@ def traced(net, x, folder):
 
 def onnx(dynamo):
     def export(net, x, folder):
+        pytest.importorskip("onnxscript")
         onnxruntime = pytest.importorskip("onnxruntime")
         file = str(folder / "net.onnx")
         shapes = {"dynamic_shapes": ({0: torch.export.Dim("batch")},)} if dynamo else {"dynamic_axes": {"x": {0: "b"}}}

@@ -10,9 +10,11 @@ import pickle
 
 import pytest
 import torch
-from tensordict import TensorDict
+from tensordict import TensorDict, TensorDictParams
+from tensordict.nn import TensorDictModule
 from torch import nn
 from torchrl._utils import logger
+from torchrl.objectives.common import LossModule
 
 from torchrl_tsallis import AdaTerm, CATSoftUpdate, TsallisBCLoss
 from torchrl_tsallis.modules import make_policy
@@ -277,6 +279,42 @@ def test_parameters_that_are_exchanged_for_others_are_named(messages):
     actor.load_state_dict(make_actor(1).state_dict(), assign=True)
     updater.step()
     assert ["assign=True" in message for message in messages] == [True]
+
+
+def test_a_loss_of_several_networks_watches_each_of_them(messages):
+    class Two(LossModule):
+        actor: TensorDictModule
+        actor_params: TensorDictParams
+        target_actor_params: TensorDictParams
+        critic: TensorDictModule
+        critic_params: TensorDictParams
+        target_critic_params: TensorDictParams
+
+        def __init__(self):
+            super().__init__()
+            torch.manual_seed(0)
+            for name, members in (("actor", None), ("critic", 2)):
+                nets = [TensorDictModule(nn.Linear(3, 4), ["x"], [name]) for _ in range(members or 1)]
+                nets = nets if members else nets[0]
+                self.convert_to_functional(nets, name, expand_dim=members, create_target_params=True)
+
+        def _forward_value_estimator_keys(self, **kwargs):
+            pass
+
+        def forward(self, tensordict):
+            return tensordict
+
+    loss = Two()
+    updater = CATSoftUpdate(loss)
+    critics = tensors(loss.target_critic_params)
+    loss.critic.load_state_dict(loss.critic.state_dict())
+    state = TensorDictModule(nn.Linear(3, 4), ["x"], ["actor"]).state_dict()
+    loss.actor.load_state_dict(state)
+    for _ in range(3):
+        updater.step()
+    same(loss.actor.state_dict(), state)
+    same(tensors(loss.target_critic_params), critics)
+    assert ["into actor_params" in message for message in messages] == [True]
 
 
 def test_copies_of_the_actor_and_files_of_it_take_no_loss_along(messages):

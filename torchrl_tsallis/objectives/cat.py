@@ -126,13 +126,19 @@ class CATSoftUpdate(TargetNetUpdater):
         self._watch_loads()
 
     def _watch_loads(self) -> None:
-        networks = [getattr(self.loss_module, name.removesuffix("_params"), None) for name in self._source_names]
-        watched = [self.loss_module, *(network for network in networks if isinstance(network, nn.Module))]
-        self._watch = LoadWatch(watched, self._before_load, self._after_load)
+        found = [getattr(self.loss_module, name.removesuffix("_params"), None) for name in self._source_names]
+        networks = [network for network in found if isinstance(network, nn.Module)]
+        self._tied = [network for network in networks if self._owns(network)]  # not the first of stacked members
+        self._watch = LoadWatch([self.loss_module, *networks], self._before_load, self._after_load)
+
+    def _owns(self, network: nn.Module) -> bool:
+        """Whether a network's parameters are those that the loss trains."""
+        own = {id(source) for group in self._groups.values() for source, _ in group.everything}
+        return all(id(p) in own for p in network.parameters())
 
     def __getstate__(self) -> dict[str, Any]:
         """A file or a copy takes no hooks along."""
-        return {name: value for name, value in self.__dict__.items() if name != "_watch"}
+        return {name: value for name, value in self.__dict__.items() if name not in ("_watch", "_tied")}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Watches the loss that came along."""
@@ -167,8 +173,8 @@ class CATSoftUpdate(TargetNetUpdater):
                 self._late.pop(name, None)
         if self._loads_target:
             self._forget()
-        elif module is not self.loss_module:
-            self._detached |= any(group.lacks(module.parameters()) for group in self._groups.values())
+        elif any(module is part for network in self._tied for part in network.modules()):
+            self._detached |= not self._owns(module)
 
     @torch.no_grad()
     def step(self) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import torch
@@ -198,11 +198,6 @@ class CATGroup:
             differs = (source != old) & ~((source != source) & (old != old))  # NaN equals NaN
             changed |= differs.reshape(*self.batch_shape, -1).any(batch_dims)
         return changed
-
-    def lacks(self, parameters: Iterable[Tensor]) -> bool:
-        """Whether some of a network's parameters are not those of the loss; those of stacked members never are."""
-        own = {id(source) for source, _ in self.everything}
-        return not self.batch_shape and any(id(p) not in own for p in parameters)
 
     def snapshot(self) -> dict[str, Any]:
         """Copies of the parameters, the target and the state."""
