@@ -260,7 +260,7 @@ def test_the_floor_is_added_after_the_maximum():
 def test_a_state_that_does_not_fit_says_what_it_is_of():
     layer, other = torch.nn.Linear(2, 1), torch.nn.Linear(3, 1)
     optim = AdaTerm(layer.parameters())
-    with pytest.raises(ValueError, match="another optimizer than AdaTerm: no 'batch_dims' in its groups"):
+    with pytest.raises(ValueError, match="another optimizer than AdaTerm: its groups have no 'batch_dims'"):
         optim.load_state_dict(torch.optim.Adam(layer.parameters(), betas=(0.9, 0.9)).state_dict())
     filled = AdaTerm(other.parameters())
     other(torch.ones(3)).sum().backward()
