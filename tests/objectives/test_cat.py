@@ -74,7 +74,7 @@ def test_single_step_by_hand(strength):
     assert theta.item() == pytest.approx(1 - strength * (0.4 - t), rel=1e-12)
     state = updater.state_dict()["cat"]["target_net_params"]
     w, largest = 2.5 / 5.5, 2.5 / 1.5
-    w_nu, bound = w - math.log(w), -math.log(torch.finfo(torch.float64).tiny)
+    w_nu, bound = w - math.log(w), 126 * math.log(2)  # 2^-126: the smallest normal float32
     star = (3.5 / 2.5 + 1.5) / w_nu * (1 - 1 / 1.5) + 1.5
     assert largest - math.log(largest) < bound
     assert next(iter(state["nu"].values())).item() == pytest.approx(1.5 + 0.4 * w_nu / bound * (star - 1.5), rel=1e-12)
@@ -156,8 +156,14 @@ def test_first_scale_waits_for_a_difference():
     _move(loss, 0, 0)
     before = [x.clone() for x in _leaves(loss.target_net_params)]
     updater.step()
-    # D = 1 and nu = 1 + eps: the share is nu / (nu + 1)
-    share = (1 + 1e-5) / (2 + 1e-5)
+    # The first step had D = 0 and nu = 1 + eps, so that w = w_max; it moved nu a little, by the equations.
+    nu = 1 + 1e-5
+    w = (nu + 1) / nu
+    w_nu = w - math.log(w)
+    star = ((nu + 2) / (nu + 1) + nu) / w_nu * (1 - 1 / nu) + 1 + 1e-5
+    nu += 0.1 * w_nu / (126 * math.log(2)) * (star - nu)
+    # Then D = 1: the share is nu / (nu + 1).
+    share = nu / (nu + 1)
     rows = zip(before, _leaves(loss.target_net_params), _leaves(loss.net_params), strict=True)
     for old, new, theta in rows:
         torch.testing.assert_close(new, old + 0.1 * share * (theta - old), rtol=1e-10, atol=1e-14)
@@ -171,6 +177,89 @@ def test_without_target_nothing_happens():
     updater.load_state_dict(updater.state_dict())
     for a, b in zip(before, _leaves(loss.net_params), strict=True):
         assert torch.equal(a, b)
+
+
+class _Twice(torch.nn.Module):
+    """A layer under as many names as asked for; the same function whatever the number."""
+
+    def __init__(self, names):
+        super().__init__()
+        self.a = torch.nn.Linear(3, 3)
+        for name in names:
+            setattr(self, name, self.a)
+        self.z = torch.nn.Linear(3, 2)
+
+    def forward(self, x):
+        return self.z(getattr(self, "m", self.a)(self.a(x)))
+
+
+@pytest.mark.parametrize("names", [["m"], ["Z"], ["b", "m", "n"]], ids=str)
+def test_a_parameter_of_several_names_is_updated_once(names):
+    losses = []
+    for more in ([], names):
+        torch.manual_seed(0)
+        losses.append(_Loss(TensorDictModule(_Twice(more), in_keys=["x"], out_keys=["y"]).double()))
+    updaters = [CATSoftUpdate(loss) for loss in losses]
+    for step in range(10):
+        for loss, updater in zip(losses, updaters, strict=True):
+            generator = torch.Generator().manual_seed(step)
+            for p in loss.parameters():
+                p.data.add_(0.01 * torch.randn(p.shape, generator=generator, dtype=p.dtype))
+            updater.step()
+    one, several = losses
+    for params in ("net_params", "target_net_params"):
+        for name in ("a", *names):
+            for leaf in ("weight", "bias"):
+                expected = getattr(one, params).get(("module", "a", leaf))
+                assert torch.equal(getattr(several, params).get(("module", name, leaf)), expected)
+        for leaf in ("weight", "bias"):
+            keys = ("module", "z", leaf)
+            assert torch.equal(getattr(several, params).get(keys), getattr(one, params).get(keys))
+    resumed = CATSoftUpdate(several)
+    resumed.load_state_dict(updaters[1].state_dict())
+
+
+def test_members_that_the_loss_leaves_out_are_not_pulled():
+    loss = _Loss([_net(0), _net(1), _net(2)])
+    loss.target_members = torch.tensor([True, False, True])
+    updater = CATSoftUpdate(loss)
+    for p in loss.parameters():
+        p.data.add_(0.01 * torch.randn_like(p))
+    before = [x.clone() for x in _leaves(loss.net_params)]
+    updater.step()
+    moved = [not torch.equal(x[k], y[k]) for k in range(3) for x, y in [(_leaves(loss.net_params)[0], before[0])]]
+    assert moved == [True, False, True]
+
+
+NUMBERS = ("tau", "strength", "eps", "k")
+
+
+@pytest.mark.parametrize("value", [None, True, "1", math.nan, -math.inf, -1, [], [0.1, 0.2], 1j], ids=str)
+@pytest.mark.parametrize("name", NUMBERS)
+def test_every_number_is_checked(name, value):
+    with pytest.raises((TypeError, ValueError), match=f"^{name} must be"):
+        CATSoftUpdate(_Loss(_net()), **{name: value})
+
+
+@pytest.mark.parametrize("name", NUMBERS)
+def test_infinity_is_for_k_alone(name):
+    if name == "k":
+        CATSoftUpdate(_Loss(_net()), k=math.inf)
+        return
+    with pytest.raises(ValueError, match=f"^{name} must be"):
+        CATSoftUpdate(_Loss(_net()), **{name: math.inf})
+
+
+@pytest.mark.parametrize("loss", [None, torch.nn.Linear(2, 2), "loss", []], ids=lambda x: type(x).__name__)
+def test_what_is_no_loss_is_named(loss):
+    with pytest.raises(TypeError, match="^loss_module must be a loss"):
+        CATSoftUpdate(loss)
+
+
+@pytest.mark.parametrize("value", [None, "first ", 1, True])
+def test_a_start_of_the_scale_that_does_not_exist_is_named(value):
+    with pytest.raises(ValueError, match="init_scale must be 'first' or 'eps'"):
+        CATSoftUpdate(_Loss(_net()), init_scale=value)
 
 
 @pytest.mark.parametrize(

@@ -19,7 +19,7 @@ class Reference:
         self.wd, self.ams, self.unc, self.ab = weight_decay, amsgrad, uncentered, adaptive_bias
         self.m, self.s = torch.zeros_like(x), torch.zeros_like(x)
         self.e, self.top = torch.full_like(x, eps**2), torch.zeros_like(x)
-        self.nu = k + eps if ini_dof is None else ini_dof
+        self.nu = k + eps if ini_dof is None or ini_dof == k else ini_dof
         self.t, self.p1, self.p2 = 0, 1.0, 1.0
 
     def step(self, g):
@@ -36,15 +36,16 @@ class Reference:
             t1, t2 = (1 - b1) * w / wm, (1 - b2) * w / wm
             de = ((d2 - dist * v) / nu).clamp(min=eps**2)
             wn = w - math.log(w)
-            tn = (1 - b3) * wn / max(wm - math.log(wm), -math.log(torch.finfo(v.dtype).tiny))
+            tn = (1 - b3) * wn / max(wm - math.log(wm), 126 * math.log(2))  # 2^-126: the smallest normal float32
             self.nu = nu + tn * (((nu + 2) / (nu + 1) + nu) / wn * (1 - k / nu) + k + eps - nu)
         self.m = self.m + t1 * (g - self.m)
         self.s = self.s + t2 * (d2 - self.s)
         self.e = self.e + t2 * (de - self.e)
         self.p1, self.p2 = self.p1 * ((1 - t1) if self.ab else b1), self.p2 * ((1 - t2) if self.ab else b2)
-        v = self.s + self.e + (self.m**2 if self.unc else 0)
+        second = self.s + self.m**2 if self.unc else self.s
         if self.ams:
-            v = self.top = torch.maximum(self.ams * self.top, v)
+            second = self.top = torch.maximum(self.ams * self.top, second)
+        v = second + self.e
         self.x = self.x - self.lr * (self.m / (1 - self.p1)) / (v / (1 - self.p2)).sqrt()
 
 
@@ -64,7 +65,9 @@ def _run(optim, params, grads):
 
 OPTIONS = [
     {}, {"weight_decay": 0.1}, {"amsgrad": 0.9}, {"amsgrad": 1.0}, {"uncentered": True}, {"adaptive_bias": True},
-    {"ini_dof": 5.0}, {"k": math.inf}, {"k": 3.0, "betas": (0.8, 0.99, 0.5), "eps": 1e-3, "lr": 0.1},
+    {"amsgrad": 0.9, "uncentered": True}, {"ini_dof": 5.0}, {"ini_dof": 1.0}, {"betas": (0.9, 0.9, 1.0)},
+    {"k": 4.0, "ini_dof": 4.0, "betas": (0.9, 0.9, 1.0)}, {"k": math.inf},
+    {"k": 3.0, "betas": (0.8, 0.99, 0.5), "eps": 1e-3, "lr": 0.1},
     {"skip_nonfinite": False},
 ]  # fmt: skip
 
@@ -163,10 +166,106 @@ def test_extremes_stay_finite(scale, shape, options):
     ("options", "match"),
     [({"lr": -1.0}, "lr"), ({"betas": (0.9, 0.9)}, "betas"), ({"eps": 0.0}, "eps"), ({"k": 0.0}, "k must"),
      ({"amsgrad": 2.0}, "amsgrad"), ({"ini_dof": 0.5}, "ini_dof"), ({"batch_dims": 2}, "batch_dims"),
-     ({"weight_decay": -1.0}, "weight_decay")],
+     ({"weight_decay": -1.0}, "weight_decay"), ({"betas": (0.9, 1.0, 0.9)}, r"betas\[1\]"),
+     ({"betas": (0.9, 0.9, 1.1)}, r"betas\[2\]"), ({"betas": []}, "betas"), ({"batch_dims": -1}, "batch_dims")],
 )  # fmt: skip
 def test_wrong_arguments(options, match):
     with pytest.raises(ValueError, match=match):
         AdaTerm([torch.nn.Parameter(torch.ones(2))], **options)
     with pytest.raises(ValueError, match="float32 or float64"):
         AdaTerm([torch.nn.Parameter(torch.ones(2).half())])
+
+
+NUMBERS = ("lr", "eps", "k", "weight_decay", "amsgrad", "ini_dof", "batch_dims")
+
+
+@pytest.mark.parametrize("name", NUMBERS)
+@pytest.mark.parametrize("value", [math.nan, -math.inf, -1, None, "1", True, [], [1e-3, 1e-3], 1j], ids=str)
+def test_every_number_is_checked(name, value):
+    if (name, value) in (("ini_dof", None), ("batch_dims", True)):
+        return
+    with pytest.raises((TypeError, ValueError), match=f"^{name} must be"):
+        AdaTerm([torch.nn.Parameter(torch.ones(2))], **{name: value})
+
+
+@pytest.mark.parametrize("name", ["lr", "eps", "weight_decay", "amsgrad", "ini_dof"])
+def test_infinity_is_refused_except_for_k(name):
+    with pytest.raises(ValueError, match=f"^{name} must be"):
+        AdaTerm([torch.nn.Parameter(torch.ones(2))], **{name: math.inf})
+
+
+@pytest.mark.parametrize(
+    "value", [None, 0.9, "0.9", 3, (0.9, None, 0.9), (0.9, 0.9, True), (0.9, math.nan, 0.9)], ids=str
+)
+def test_betas_are_three_numbers(value):
+    with pytest.raises((TypeError, ValueError), match="^betas"):
+        AdaTerm([torch.nn.Parameter(torch.ones(2))], betas=value)
+
+
+@pytest.mark.parametrize("name", ["uncentered", "adaptive_bias", "skip_nonfinite"])
+@pytest.mark.parametrize("value", [None, 1, "yes", 0.0], ids=str)
+def test_switches_are_true_or_false(name, value):
+    with pytest.raises(TypeError, match=f"^{name} must be True or False"):
+        AdaTerm([torch.nn.Parameter(torch.ones(2))], **{name: value})
+
+
+@pytest.mark.parametrize(
+    "params", [None, [], 1.0, "weights", torch.nn.Linear(2, 2), torch.nn.Parameter(torch.ones(2)), [None], [1.0],
+               {"params": []}, [{"lr": 1.0}], [{"params": None}], [torch.nn.Linear(2, 2)]],
+    ids=lambda x: repr(x)[:20].replace(chr(10), ""),
+)  # fmt: skip
+def test_what_are_no_parameters_is_named(params):
+    with pytest.raises((TypeError, ValueError), match="^params"):
+        AdaTerm(params)
+
+
+def test_options_of_a_group_are_checked_and_a_refused_group_leaves_no_trace():
+    optim = AdaTerm([torch.nn.Parameter(torch.ones(2))])
+    for wrong in ({"lr": math.nan}, {"eps": None}, {"betas": (0.9, 0.9)}):
+        with pytest.raises((TypeError, ValueError), match=next(iter(wrong))):
+            optim.add_param_group({"params": [torch.nn.Parameter(torch.ones(3))], **wrong})
+        assert len(optim.param_groups) == 1
+
+
+def test_named_parameters_and_a_learning_rate_in_a_tensor_are_taken():
+    layer = torch.nn.Linear(2, 1)
+    optim = AdaTerm(layer.named_parameters(), lr=torch.tensor(0.1))
+    before = layer.weight.detach().clone()
+    layer(torch.ones(2)).sum().backward()
+    optim.step()
+    assert isinstance(optim.param_groups[0]["lr"], torch.Tensor)
+    assert (layer.weight < before).all()
+
+
+def test_degrees_of_freedom_move_alike_in_both_data_types():
+    nus = []
+    for dtype in (torch.float32, torch.float64):
+        p = torch.nn.Parameter(torch.ones(50, dtype=dtype))
+        optim = AdaTerm([p], ini_dof=3.0)
+        _run(optim, [p], [[torch.full((50,), 100.0, dtype=dtype)]])
+        nus.append(optim.state[p]["nu"].item())
+    # D = 1e14: w = 4e-14, w - ln w = 30.85, of 87.34 at most; nu* = (1.25 + 3) / 30.85 * (1 - 1/3) + 1 = 1.0918
+    assert nus == pytest.approx([3 + 0.1 * 30.85 / 87.34 * (1.0918 - 3)] * 2, rel=1e-4)
+
+
+def test_the_floor_is_added_after_the_maximum():
+    p = torch.nn.Parameter(torch.zeros(1, dtype=torch.float64))
+    optim = AdaTerm([p], lr=1.0, k=math.inf, eps=1.0, amsgrad=1.0)
+    _run(optim, [p], [[torch.ones(1, dtype=torch.float64)]])
+    # m = 0.1, c1 = 0.1; s = 0.1, c2 = 0.1: 1 / sqrt((0.1 + 1) / 0.1)
+    assert p.item() == pytest.approx(-1 / math.sqrt(11.0), rel=1e-12)
+    assert optim.state[p]["max_exp_avg_sq"].item() == pytest.approx(0.1, rel=1e-12)
+
+
+def test_a_state_that_does_not_fit_says_what_it_is_of():
+    layer, other = torch.nn.Linear(2, 1), torch.nn.Linear(3, 1)
+    optim = AdaTerm(layer.parameters())
+    with pytest.raises(ValueError, match="another optimizer than AdaTerm: its groups have no 'batch_dims'"):
+        optim.load_state_dict(torch.optim.Adam(layer.parameters(), betas=(0.9, 0.9)).state_dict())
+    filled = AdaTerm(other.parameters())
+    other(torch.ones(3)).sum().backward()
+    filled.step()
+    optim.load_state_dict(filled.state_dict())
+    layer(torch.ones(2)).sum().backward()
+    with pytest.raises(ValueError, match=r"'exp_avg' has shape \(1, 3\).*\(1, 2\).*another network"):
+        optim.step()

@@ -7,27 +7,30 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from torchrl_tsallis.modules.numerics import is_traced, widened
+
 
 def squareplus(x: Tensor) -> Tensor:
     r"""Algebraic softplus, :math:`(x + \sqrt{x^2 + 4}) / 2` (Barron, arXiv 2112.11687).
 
     For negative x the equal form :math:`2 / (\sqrt{x^2+4} - x)` is used, which does not cancel: the result is positive
-    for every finite x that float32 can square.
+    for every finite x that float32 can square. Half precision is computed in float32.
 
     Args:
         x: any shape.
 
     Returns:
-        A positive number for each entry.
+        A positive number for each entry, of the same data type.
 
     Examples:
         >>> import torch
         >>> squareplus(torch.tensor([0.0, -1e4]))
         tensor([1.0000e+00, 1.0000e-04])
     """
+    given, x = x.dtype, widened(x)
     root = (x.square() + 4).sqrt()
     # |x| rather than -x: the branch that is not taken must stay finite, or its gradient becomes 0 * inf.
-    return ((x + root) / 2).where(x >= 0, 2 / (root + x.abs()))
+    return ((x + root) / 2).where(x >= 0, 2 / (root + x.abs())).to(given)
 
 
 class _Squish(torch.autograd.Function):
@@ -59,22 +62,23 @@ class _Squish(torch.autograd.Function):
 def squish(x: Tensor) -> Tensor:
     r"""Swish with an algebraic sigmoid, :math:`x (1 + x / \sqrt{x^2 + 4}) / 2` (method of section V-B).
 
-    The sigmoid is squareplus' derivative. The paper only cites Squish; this form is this project's reading.
+    The sigmoid is squareplus' derivative. The paper only cites Squish; this form is this project's reading. Half
+    precision is computed in float32.
 
     Args:
         x: any shape.
 
     Returns:
-        The activation, same shape.
+        The activation, same shape and data type.
 
     Examples:
         >>> import torch
         >>> squish(torch.tensor([0.0, 1.5]))
         tensor([0.0000, 1.2000])
     """
-    if torch.compiler.is_compiling():  # a compiler fuses the plain formula
-        return x * (1 + x * (x.square() + 4).rsqrt()) / 2
-    return _Squish.apply(x)[0]
+    given, x = x.dtype, widened(x)
+    y: Tensor = x * (1 + x * (x.square() + 4).rsqrt()) / 2 if is_traced() else _Squish.apply(x)[0]
+    return y.to(given)
 
 
 class Squish(nn.Module):

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from torch import Tensor, nn
+
+from torchrl_tsallis.modules.settings import check_dims
 
 
 class Linear(nn.Linear):
@@ -11,6 +15,15 @@ class Linear(nn.Linear):
 
     With ``stackable = True`` a module says that it does so. A network of such modules runs for S members at once by
     batched products, where others need ``torch.vmap``, whose overhead is that of a small network.
+
+    Args:
+        in_features: length of the input's last dimension.
+        out_features: length of the output's.
+        **kwargs: ``bias``, ``device`` and ``dtype``, as for ``torch.nn.Linear``.
+
+    Raises:
+        TypeError: for a length that is no integer.
+        ValueError: for one under 1.
 
     Examples:
         >>> layer = Linear(3, 2)
@@ -20,6 +33,10 @@ class Linear(nn.Linear):
     """
 
     stackable = True
+
+    def __init__(self, in_features: int, out_features: int, **kwargs: Any) -> None:
+        check_dims(in_features=in_features, out_features=out_features)
+        super().__init__(in_features, out_features, **kwargs)
 
     def forward(self, x: Tensor) -> Tensor:
         """Maps ``[*B, in]`` to ``[*B, out]``."""

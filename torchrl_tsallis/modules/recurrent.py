@@ -9,7 +9,9 @@ from torch import _VF, Tensor, nn
 from torch.nn.utils.rnn import PackedSequence
 from torchrl.modules import IndependentNormal, LSTMModule, ProbabilisticActor
 
+from torchrl_tsallis._checks import check_number
 from torchrl_tsallis.modules.policy import NormalHead
+from torchrl_tsallis.modules.settings import check_dims, check_key
 
 State = tuple[Tensor, Tensor]
 
@@ -34,7 +36,8 @@ class NoisyLSTM(nn.LSTM):
         state_noise: scale of the noise (1e-3, section VI-A).
 
     Raises:
-        ValueError: if the scale is negative.
+        TypeError: for an argument that is no number, or a dimension that is no integer.
+        ValueError: if a dimension is not positive, or the scale is negative or not finite.
 
     Examples:
         >>> output, (h, c) = NoisyLSTM(3, 5, 2)(torch.zeros(4, 7, 3))
@@ -43,8 +46,8 @@ class NoisyLSTM(nn.LSTM):
     """
 
     def __init__(self, input_size: int, hidden_size: int, num_layers: int = 1, *, state_noise: float = 1e-3) -> None:
-        if not state_noise >= 0:
-            raise ValueError(f"state_noise must not be negative, got {state_noise}")
+        check_dims(input_size=input_size, hidden_size=hidden_size, num_layers=num_layers)
+        state_noise = check_number("state_noise", state_noise, low=0)
         super().__init__(input_size, hidden_size, num_layers, batch_first=True)
         self.state_noise = state_noise
 
@@ -147,7 +150,8 @@ def make_recurrent_policy(
         An actor that writes ``loc``, ``scale``, the prediction, the recurrent state and the action.
 
     Raises:
-        ValueError: if a dimension is not positive, or the noise is negative.
+        TypeError: for a dimension that is no integer, a number that is none, or a key that is none.
+        ValueError: if a dimension is not positive, a noise or scale negative or not finite, or a key empty.
 
     Examples:
         >>> from tensordict import TensorDict
@@ -159,10 +163,11 @@ def make_recurrent_policy(
         >>> out["action"].shape, out["predicted_observation"].shape
         (torch.Size([2, 7, 3]), torch.Size([2, 7, 12]))
     """
-    if min(obs_dim, action_dim, hidden_size, num_layers) < 1:
-        raise ValueError(
-            f"every dimension must be positive, got {obs_dim=}, {action_dim=}, {hidden_size=}, {num_layers=}"
-        )
+    check_dims(obs_dim=obs_dim, action_dim=action_dim, hidden_size=hidden_size, num_layers=num_layers)
+    check_key("observation_key", observation_key)
+    check_key("action_key", action_key)
+    if prediction_key is not None:
+        check_key("prediction_key", prediction_key)
     lstm = LSTMModule(
         lstm=NoisyLSTM(obs_dim, hidden_size, num_layers, state_noise=state_noise),
         in_key=observation_key,

@@ -2,21 +2,20 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from typing import Any, Literal
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
+from torchrl._utils import logger
 from torchrl.objectives.common import LossModule
 from torchrl.objectives.utils import TargetNetUpdater
 
-from torchrl_tsallis._segments import Segments
-from torchrl_tsallis._student_t import floor_target, robust_rate
+from torchrl_tsallis._checks import check_number
+from torchrl_tsallis.objectives.cat_group import CATGroup
+from torchrl_tsallis.objectives.replaced import LoadWatch
 
 __all__ = ["CATSoftUpdate"]
-
-_SCALARS = ("nu", "started")
 
 
 class CATSoftUpdate(TargetNetUpdater):
@@ -29,11 +28,20 @@ class CATSoftUpdate(TargetNetUpdater):
         thetabar += t (theta - thetabar);  v += t (d2 + max(eps^2, (d2 - D v) / nu) - v);  nu += t_nu (nu* - nu)
         theta -= strength (tau - t) (theta - thetabar_before)
 
-    ``t_nu`` and ``nu*`` are those of :func:`torchrl_tsallis._student_t.robust_rate` with rate ``tau``. Leading
+    ``t_nu`` and ``nu*`` are those of :func:`torchrl_tsallis.optim.student_t.robust_rate` with rate ``tau``. Leading
     dimensions of stacked (ensemble) parameters have scalars of their own, and a member that the loss's
     ``target_members`` leaves out is not pulled. ``k=inf, strength=0`` is torchrl's
     ``SoftUpdate(tau=tau)``. A loss without target parameters is accepted; nothing is updated then. Call
-    :meth:`step` after the optimizer's step. A deep copy of the updater no longer follows: make a new one.
+    :meth:`step` after the optimizer's step. A deep copy of the updater no longer follows: make a new one. A parameter
+    under several names is updated once.
+
+    **Policies that are loaded late.** Parameters that are loaded into the actor while its target is another network
+    would be pulled to that network and destroyed. Whatever comes through ``load_state_dict`` of the actor, of a part of
+    it or of the loss starts the target and its state anew at the loaded parameters, of those members whose parameters
+    changed, and the next :meth:`step` says so by a warning. What is written into the parameters in another way is
+    noticed in :meth:`step`, by its having nothing in common with what was there: at the first step, and on a CPU at any
+    later one. If the loss's state dict brings its target along, both are taken as they come, and a checkpoint continues
+    bit for bit; if what was there is loaded back before the next step, so is the target.
 
     Source: Kobayashi, "Consolidated Adaptive T-soft Update for Deep Reinforcement Learning", arXiv 2202.12504. The
     consolidation is this project's reading: the refused share is applied the other way.
@@ -50,6 +58,7 @@ class CATSoftUpdate(TargetNetUpdater):
             not 0, or at ``eps^2``, where the first steps are all taken for outliers. Default: ``"first"``.
 
     Raises:
+        TypeError: for an argument of the wrong type, such as None, or a truth value where a number is wanted.
         ValueError: for an argument outside of its range, and for a state dict that does not fit.
         KeyError: for a state dict that lacks an entry.
 
@@ -71,19 +80,22 @@ class CATSoftUpdate(TargetNetUpdater):
         k: float = 1.0,
         init_scale: Literal["first", "eps"] = "first",
     ) -> None:
-        for name, value in (("tau", tau), ("strength", strength)):
-            if not 0 <= value <= 1:
-                raise ValueError(f"{name} must be in [0, 1], got {value}")
-        if not 0 < eps < math.inf:
-            raise ValueError(f"eps must be positive and finite, got {eps}")
-        if not k > 0:
-            raise ValueError(f"k must be positive (inf switches the robustness off), got {k}")
+        if not isinstance(loss_module, LossModule):
+            raise TypeError(f"loss_module must be a loss, as TsallisBCLoss, got {type(loss_module).__name__}")
+        tau = check_number("tau", tau, low=0, high=1)
+        strength = check_number("strength", strength, low=0, high=1)
+        eps = check_number("eps", eps, above=0)
+        k = check_number("k", k, above=0, finite=False)  # inf switches the robustness off
         if init_scale not in ("first", "eps"):
             raise ValueError(f"init_scale must be 'first' or 'eps', got {init_scale!r}")
         self.tau, self.strength, self.eps, self.k, self.init_scale = tau, strength, eps, k, init_scale
-        self._cat: dict[str, _Group] = {}
-        names = [n for n, _ in loss_module.named_children()] if isinstance(loss_module, LossModule) else [""]
-        self._active = any(n == "" or (n.startswith("target_") and n.endswith("_params")) for n in names)
+        self._groups: dict[str, CATGroup] = {}
+        self._before: dict[str, dict[str, Any]] | None = None  # what was there before a load, until the next step
+        self._loads_target = False
+        self._late: dict[str, Tensor] = {}  # members whose parameters were loaded since the last step
+        self._detached = False
+        names = [name for name, _ in loss_module.named_children()]
+        self._active = any(name.startswith("target_") and name.endswith("_params") for name in names)
         if self._active:
             super().__init__(loss_module)
         else:
@@ -91,126 +103,118 @@ class CATSoftUpdate(TargetNetUpdater):
             self._target_names: list[str] = []
             self._source_names: list[str] = []
 
+    @torch.no_grad()
     def init_(self) -> None:
         """Copies the parameters to the target and starts the state anew."""
         if not self._active:
             return
         super().init_()
-        sources = {f"target_{name}": source for name, source in self._sources.items()}
-        self._cat = {name: _Group(self, sources[name], target) for name, target in self._targets.items()}
+        self._groups = {
+            f"target_{name}": CATGroup(
+                trained,
+                self._targets[f"target_{name}"],
+                (getattr(self.loss_module, name), getattr(self.loss_module, f"target_{name}")),
+                eps=self.eps,
+                k=self.k,
+                from_first=self.init_scale == "first",
+            )
+            for name, trained in self._sources.items()
+        }
+        for group in self._groups.values():  # what is not trained too
+            group.restart(torch.ones(group.batch_shape, dtype=torch.bool, device=group.target[0].device))
+        self._forget()
+        self._watch_loads()
+
+    def _watch_loads(self) -> None:
+        found = [getattr(self.loss_module, name.removesuffix("_params"), None) for name in self._source_names]
+        networks = [network for network in found if isinstance(network, nn.Module)]
+        self._tied = [network for network in networks if self._owns(network)]  # not the first of stacked members
+        self._watch = LoadWatch([self.loss_module, *networks], self._before_load, self._after_load)
+
+    def _owns(self, network: nn.Module) -> bool:
+        """Whether a network's parameters are those that the loss trains."""
+        own = {id(source) for group in self._groups.values() for source, _ in group.everything}
+        return all(id(p) in own for p in network.parameters())
+
+    def __getstate__(self) -> dict[str, Any]:
+        """A file or a copy takes no hooks along."""
+        return {name: value for name, value in self.__dict__.items() if name not in ("_watch", "_tied")}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Watches the loss that came along."""
+        self.__dict__.update(state)
+        if self._active:
+            self._watch_loads()
+
+    def _forget(self) -> None:
+        self._before, self._late, self._detached = None, {}, False
+
+    @torch.no_grad()
+    def _before_load(self, state_dict: Mapping[str, Any], prefix: str) -> None:
+        """Keeps what is there: the load may bring it back, or only change a part."""
+        self._loads_target = any(key.startswith(tuple(f"{prefix}{n}." for n in self._groups)) for key in state_dict)
+        if self._before is None:
+            self._before = {name: group.snapshot() for name, group in self._groups.items()}
+
+    @torch.no_grad()
+    def _after_load(self, module: nn.Module) -> None:
+        """Starts the targets of loaded parameters anew at them."""
+        for name, group in self._groups.items():
+            before = (self._before or {})[name]
+            if self._loads_target:  # as in a checkpoint: both are as they should be
+                group.restore(before, target=False)
+                continue
+            group.restore(before)
+            changed = group.changed(before)
+            if changed.any():
+                group.restart(changed)
+                self._late[name] = changed
+            else:
+                self._late.pop(name, None)
+        if self._loads_target:
+            self._forget()
+        elif any(module is part for network in self._tied for part in network.modules()):
+            self._detached |= not self._owns(module)
 
     @torch.no_grad()
     def step(self) -> None:
         """Updates the targets, and the parameters by the consolidation."""
-        for group in self._cat.values():
-            group.step(self)
+        members = getattr(self.loss_module, "target_members", None)
+        for name, group in self._groups.items():
+            replaced = group.step(self.tau, self.strength, members)
+            if replaced is not None:
+                self._late[name] = replaced | self._late.get(name, replaced)
+        if self._before is not None or self._late:
+            self._warn()
+            self._forget()
+
+    def _warn(self) -> None:
+        for name, changed in self._late.items():
+            some = f" of members {changed.nonzero()[:, 0].tolist()}" if changed.ndim else ""
+            logger.warning(
+                f"other parameters{some} were loaded into {name.removeprefix('target_')} after its target network was "
+                "made: the target starts anew at them. Load a policy before CATSoftUpdate is made, or a checkpoint by "
+                "loss.load_state_dict, which restores the target too"
+            )
+        if self._detached:
+            logger.warning(
+                "load_state_dict(assign=True) gave the actor other parameters than those that the loss trains: load "
+                "without assign, or before the loss is made"
+            )
 
     def state_dict(self) -> dict[str, Any]:
         """Copy of the complete state: ``cat/<target group>/<scale|nu|started>/<dotted key>``."""
-        return {**super().state_dict(), "cat": {name: group.state_dict() for name, group in self._cat.items()}}
+        return {**super().state_dict(), "cat": {name: group.state_dict() for name, group in self._groups.items()}}
 
     def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
         """Loads a state in place, after checking all of it."""
         state = state_dict.get("cat", {})
-        if set(state) != set(self._cat):
-            raise KeyError(f"groups of the state dict are {sorted(state)}, of the loss {sorted(self._cat)}")
+        if set(state) != set(self._groups):
+            raise KeyError(f"groups of the state dict are {sorted(state)}, of the loss {sorted(self._groups)}")
         for check_only in (True, False):
-            for name, group in self._cat.items():
+            for name, group in self._groups.items():
                 group.load(name, state[name], check_only)
+        if self._before is not None:  # whatever the order in which actor, loss and updater are loaded
+            for name, group in self._groups.items():
+                self._before[name] |= {"state": {n: x.clone() for n, x in group.state.items()}, "waiting": True}
         super().load_state_dict(state_dict)
-
-
-class _Group:
-    """State of one group of target parameters: flat ``scale``, stacked ``nu`` and ``started``."""
-
-    def __init__(self, updater: CATSoftUpdate, source: Any, target: Any) -> None:
-        self.keys = sorted(target.keys(True, True), key=str)
-        self.names = [k if isinstance(k, str) else ".".join(k) for k in self.keys]
-        # Both are locked: their tensors stay these. To look them up each step would cost as much as the update.
-        self.source, self.target = ([params.get(k) for k in self.keys] for params in (source, target))
-        self.segments = Segments(self.target, target.batch_dims)
-        flat, eps = self.segments.flatten(self.target), updater.eps
-        self.waiting = True  # for the first difference of some tensor
-        count, first = self.segments.num_segments, updater.init_scale == "first"
-        self.state = {
-            "scale": torch.full_like(flat, eps**2),
-            "nu": flat.new_full((count,), updater.k + eps),
-            "started": flat.new_full((count,), 0.0 if first else 1.0),
-        }
-        self.alone: Tensor | None = None
-        self.buffers: list[tuple[Tensor, list[Tensor]]] = []  # of a step
-
-    def __getstate__(self) -> dict[str, Any]:
-        """A pickled view is no view any more: the buffers are made anew."""
-        return {**self.__dict__, "buffers": []}
-
-    def _start_scale(self, d2: Tensor, eps: float) -> None:
-        """Starts the scale of each tensor at its first squared difference that is not 0."""
-        seg, v, started = self.segments, self.state["scale"], self.state["started"]
-        first = seg.mean(d2)
-        fresh = (started == 0) & (first > 0)
-        v.copy_(torch.where(seg.expand(fresh), seg.expand(first.clamp(eps**2, torch.finfo(v.dtype).max / 16)), v))
-        started.masked_fill_(fresh, 1.0)
-        self.waiting = not bool(started.all())
-
-    def _prepare(self, loss_module: LossModule) -> None:
-        """Makes the buffers, and moves the state to the parameters' data type and device."""
-        like = self.target[0]
-        self.state = {name: x.to(like) for name, x in self.state.items()}
-        self.segments = Segments(self.target, self.segments.batch_dims)
-        self.buffers = [self.segments.buffer(like) for _ in range(2)]
-        pulled = getattr(loss_module, "target_members", None)
-        if pulled is not None and self.segments.batch_dims == 1:
-            self.alone = self.segments.expand(~pulled.to(like.device).repeat(len(self.target)))
-
-    def step(self, updater: CATSoftUpdate) -> None:
-        """One update, in place of the source and the target."""
-        source, target, scale = self.source, self.target, self.state["scale"]
-        if not self.buffers or scale.dtype != target[0].dtype or scale.device != target[0].device:
-            self._prepare(updater.loss_module)
-        seg, eps, tau = self.segments, updater.eps, updater.tau
-        (d, d_views), (followed, followed_views) = self.buffers
-        torch._foreach_copy_(d_views, source)
-        torch._foreach_sub_(d_views, target)
-        v, nu = self.state["scale"], self.state["nu"]
-        d2 = d.square().clamp_(max=torch.finfo(d.dtype).max / 16)
-        if self.waiting:
-            self._start_scale(d2, eps)
-        distance = seg.mean(d2 / v)
-        share, new_nu = robust_rate(distance, nu, tau, updater.k, eps)
-        floor = floor_target(d2, v, seg.expand(distance), seg.expand(nu.reciprocal()), eps)
-        rate = seg.expand(share.mul_(tau))
-        v.addcmul_(rate, d2.add_(floor).sub_(v))
-        nu.copy_(new_nu)
-        torch.mul(rate, d, out=followed)
-        torch._foreach_add_(target, followed_views)
-        if updater.strength:  # strength (tau - t) d, by what was not followed
-            d.mul_(tau).sub_(followed)
-            if self.alone is not None:
-                d.masked_fill_(self.alone, 0.0)  # a member that is not rated by its target is left alone
-            torch._foreach_sub_(source, d_views, alpha=updater.strength)
-
-    def views(self, name: str) -> dict[str, Tensor]:
-        """Views of one entry of the state by dotted key."""
-        split = self.segments.scalar_views if name in _SCALARS else self.segments.views
-        return dict(zip(self.names, split(self.state[name]), strict=True))
-
-    def state_dict(self) -> dict[str, dict[str, Tensor]]:
-        """Copies of the state by name and dotted key."""
-        return {name: {key: x.clone() for key, x in self.views(name).items()} for name in self.state}
-
-    def load(self, group: str, state: Mapping[str, Mapping[str, Tensor]], check_only: bool) -> None:
-        """Checks or copies a state."""
-        for name in self.state:
-            for key, x in self.views(name).items():
-                if key not in state.get(name, {}):
-                    raise KeyError(f"the state dict of group {group!r} has no {name!r} of {key!r}")
-                value = state[name][key]
-                if value.shape != x.shape:
-                    raise ValueError(
-                        f"{name!r} of {key!r} in group {group!r} has shape {tuple(value.shape)} in the state dict, "
-                        f"{tuple(x.shape)} in the loss; load it in a loss of the same architecture"
-                    )
-                if not check_only:
-                    x.copy_(value)
-        self.waiting = True

@@ -10,8 +10,9 @@ import torch
 from torch import Tensor
 from torch.optim import Optimizer
 
-from torchrl_tsallis._segments import Segments
-from torchrl_tsallis._student_t import floor_target, robust_rate
+from torchrl_tsallis.optim.options import check_group, check_params
+from torchrl_tsallis.optim.segments import Segments
+from torchrl_tsallis.optim.student_t import floor_target, robust_rate
 
 __all__ = ["AdaTerm"]
 
@@ -26,9 +27,12 @@ class AdaTerm(Optimizer):
         m += t1 (g - m);  s += t2 (d2 - s);  e += t2 (de - e);  nu += t_nu (nu* - nu)
         theta -= lr (m / (1-beta1^t)) / sqrt((s + e) / (1-beta2^t))
 
-    ``t_nu`` and ``nu*`` are those of :func:`torchrl_tsallis._student_t.robust_rate`. ``D``, ``w`` and ``nu`` are
+    ``t_nu`` and ``nu*`` are those of :func:`torchrl_tsallis.optim.student_t.robust_rate`. ``D``, ``w`` and ``nu`` are
     scalars per tensor, or per ensemble member with ``batch_dims``. The state of a group is held in flat vectors, and
     all of its scalars in one tensor, so a step does not read anything back from the device.
+
+    With ``amsgrad``, ``s`` is replaced by its decaying maximum in the last line (of ``s + m^2`` where uncentered), to
+    which the floor ``e`` is added.
 
     State per parameter: ``step``, ``exp_avg`` (m), ``exp_avg_sq`` (s), ``floor`` (e), ``nu``, ``skipped`` (number of
     refused updates), and ``max_exp_avg_sq``, ``bias1``, ``bias2`` where the option asks for them.
@@ -39,25 +43,26 @@ class AdaTerm(Optimizer):
     Args:
         params: parameters (float32 or float64) or parameter groups; each option below may differ by group.
         lr: learning rate. Default: 1e-3.
-        betas: decay of the first moment, of the second, and of the degrees of freedom, in [0, 1).
-            Default: (0.9, 0.9, 0.9).
+        betas: decay of the first moment and of the second, in [0, 1), and of the degrees of freedom, in [0, 1], where
+            1 keeps them as they start. Default: (0.9, 0.9, 0.9).
         eps: square root of the variance's least floor. Default: 1e-5.
         k: lower bound of the degrees of freedom; ``inf`` switches the robustness off. Default: 1.0.
         weight_decay: factor of the parameters that is added to the gradient (L2, as in ``torch.optim.Adam``).
             Default: 0.
-        amsgrad: decay in [0, 1] of the running maximum of the variance; 0 is off, 1 never forgets. Default: 0.
+        amsgrad: decay in [0, 1] of the running maximum of the second moment; 0 is off, 1 never forgets. Default: 0.
         uncentered: divide by the uncentered second moment, ``s + e + m^2``. Default: False.
         adaptive_bias: correct the bias by the accumulated actual rates ``t1``, ``t2`` instead of powers of beta.
             Default: False.
-        ini_dof: initial degrees of freedom, at least ``k``. Default: None, ``k + eps``.
+        ini_dof: initial degrees of freedom, at least ``k``; less than ``k + eps`` starts there. Default: None, ``k``.
         batch_dims: number of leading ensemble dimensions of each parameter; members do not influence each other.
             Default: 0.
         skip_nonfinite: leave a tensor (or member) and its state as they are where its gradient is not finite.
             Default: True.
 
     Raises:
-        ValueError: for an argument outside of its range, and for parameters of another type or with too few
-            dimensions.
+        TypeError: for an argument of the wrong type, such as None, or a truth value where a number is wanted.
+        ValueError: for an argument outside of its range, for no parameters at all, and for parameters of another type
+            or with too few dimensions.
         RuntimeError: for sparse gradients.
 
     Examples:
@@ -90,17 +95,34 @@ class AdaTerm(Optimizer):
         names = ("betas", "eps", "k", "weight_decay", "amsgrad", "uncentered", "adaptive_bias", "ini_dof")
         values = (betas, eps, k, weight_decay, amsgrad, uncentered, adaptive_bias, ini_dof)
         rest = {"lr": lr, "batch_dims": batch_dims, "skip_nonfinite": skip_nonfinite}
-        super().__init__(params, {**rest, **dict(zip(names, values, strict=True))})
+        super().__init__(check_params(params), {**rest, **dict(zip(names, values, strict=True))})
 
     def add_param_group(self, param_group: dict[str, Any]) -> None:
         """Adds a group of parameters with its own options, after checking them."""
         super().add_param_group(param_group)
         try:
-            _check_group(self.param_groups[-1])
-        except ValueError:
+            check_group(self.param_groups[-1])
+        except (TypeError, ValueError):
             self.param_groups.pop()
             raise
         self._layouts.clear()
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Loads a state of this optimizer.
+
+        Args:
+            state_dict: of an ``AdaTerm`` of as many parameters.
+
+        Raises:
+            ValueError: if it is of another optimizer, or its groups do not fit.
+        """
+        for group in state_dict.get("param_groups", ()):
+            missing = [name for name in self.defaults if name not in group]
+            if missing:
+                raise ValueError(
+                    f"the state dict is of another optimizer than AdaTerm: its groups have no {missing[0]!r}"
+                )
+        super().load_state_dict(state_dict)
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Restores a pickled or loaded state; the flat vectors are rebuilt at the next step."""
@@ -139,34 +161,6 @@ class AdaTerm(Optimizer):
         return loss
 
 
-def _check_group(group: dict[str, Any]) -> None:
-    """Raises ValueError for options outside of their range and for parameters that do not fit."""
-
-    def check(name: str, valid: bool, wanted: str) -> None:
-        if not valid:
-            raise ValueError(f"{name} must be {wanted}, got {group[name]!r}")
-
-    check("lr", bool(group["lr"] >= 0), "at least 0")
-    betas = group["betas"]
-    check("betas", len(betas) == 3 and all(0 <= b < 1 for b in betas), "three numbers in [0, 1)")
-    check("eps", 0 < group["eps"] < math.inf, "positive and finite")
-    check("k", group["k"] > 0, "positive (inf switches the robustness off)")
-    check("weight_decay", 0 <= group["weight_decay"] < math.inf, "at least 0")
-    check("amsgrad", 0 <= group["amsgrad"] <= 1, "in [0, 1]")
-    dof = group["ini_dof"]
-    valid = dof is None or (dof == group["k"] if math.isinf(group["k"]) else group["k"] <= dof < math.inf)
-    check("ini_dof", valid, f"None, or finite and at least k = {group['k']}")
-    check("batch_dims", isinstance(group["batch_dims"], int) and group["batch_dims"] >= 0, "an integer of at least 0")
-    for p in group["params"]:
-        if p.dtype not in (torch.float32, torch.float64):
-            raise ValueError(f"parameters must be float32 or float64, got {p.dtype}; keep a float32 copy of them")
-        if p.ndim < group["batch_dims"]:
-            raise ValueError(
-                f"a parameter of shape {tuple(p.shape)} has fewer than batch_dims = {group['batch_dims']} dimensions; "
-                "put it in a group of its own with batch_dims=0"
-            )
-
-
 class _Layout:
     """Flat state of the active parameters of one group, data type and device; ``state`` holds views of it."""
 
@@ -180,17 +174,22 @@ class _Layout:
         self.grad, self.grad_views = self.segments.buffer(params[0])
         self.update, self.update_views = self.segments.buffer(params[0])
         self.zero = params[0].new_zeros(())
-        dof = group["k"] + group["eps"] if group["ini_dof"] is None else group["ini_dof"]
+        dof = max(group["k"] + group["eps"], group["ini_dof"] or 0.0)
         scalars = {"step": 0.0, "nu": dof, "skipped": 0.0}
         scalars |= {"bias1": 0.0, "bias2": 0.0} if group["adaptive_bias"] else {}
         vectors = {"exp_avg": 0.0, "exp_avg_sq": 0.0, "floor": group["eps"] ** 2}
         vectors |= {"max_exp_avg_sq": 0.0} if group["amsgrad"] else {}
         for name, start in {**scalars, **vectors}.items():
             shapes = self.segments.batch_shapes if name in scalars else self.segments.shapes
-            parts = [
-                state[p][name].to(p) if name in state[p] else p.new_full(shape, start)
-                for p, shape in zip(params, shapes, strict=True)
-            ]
+            parts = []
+            for p, shape in zip(params, shapes, strict=True):
+                part = state[p][name].to(p) if name in state[p] else p.new_full(shape, start)
+                if part.shape != shape:
+                    raise ValueError(
+                        f"the optimizer's state {name!r} has shape {tuple(part.shape)}, its parameter of shape "
+                        f"{tuple(p.shape)} needs {tuple(shape)}: the state dict is of another network"
+                    )
+                parts.append(part)
             flat = self.segments.flatten(parts)
             self.flat[name] = flat
             views = self.segments.scalar_views(flat) if name in scalars else self.segments.views(flat)
@@ -233,15 +232,17 @@ class _Layout:
         s.addcmul_(share_flat, d2.sub_(s), value=1 - beta2)
         floor.addcmul_(share_flat, de.sub_(floor), value=1 - beta2)
         nu.copy_(new_nu)
-        v = torch.add(s, floor, out=v)
-        if group["uncentered"]:
-            v.addcmul_(m, m).clamp_(max=self.limit)
+        second = s
         if group["amsgrad"]:
             largest = f["max_exp_avg_sq"]
-            v = torch.maximum(largest * group["amsgrad"], v)
+            moment = torch.addcmul(s, m, m).clamp_(max=self.limit) if group["uncentered"] else s
+            second = torch.maximum(largest * group["amsgrad"], moment)
             if bad is not None:
-                v = torch.where(seg.expand(bad), largest, v)
-            largest.copy_(v)
+                second = torch.where(seg.expand(bad), largest, second)
+            largest.copy_(second)
+        v = torch.add(second, floor, out=v)
+        if group["uncentered"] and not group["amsgrad"]:
+            v.addcmul_(m, m).clamp_(max=self.limit)
         scale = self._bias_correction(group, share, beta1, beta2) * group["lr"]
         if bad is not None:
             scale, v = scale.masked_fill(bad, 0.0), v.clamp_(min=torch.finfo(v.dtype).tiny)

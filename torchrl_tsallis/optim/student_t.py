@@ -16,6 +16,8 @@ from torch import Tensor
 
 __all__ = ["floor_target", "robust_rate"]
 
+_TINY = torch.finfo(torch.float32).tiny
+
 
 def robust_rate(distance: Tensor, nu: Tensor, rate_nu: float, k: float, eps: float) -> tuple[Tensor, Tensor]:
     r"""Share of the moving average's rate that a sample gets, and the next degrees of freedom.
@@ -26,10 +28,14 @@ def robust_rate(distance: Tensor, nu: Tensor, rate_nu: float, k: float, eps: flo
         t_nu = rate_nu w_nu / w_nu_max;  w_nu = w - ln w;  w_nu_max = max(w_max - ln w_max, -ln(smallest normal number))
         nu* = ((nu+2)/(nu+1) + nu) / w_nu * (1 - k/nu) + k + eps
 
+    The smallest normal number is float32's, 2^-126, for every data type: it is a constant of the rule, and with
+    float64's own the degrees of freedom would move eight times more slowly in float64 than in float32. No weight is
+    less than it, so that ``t_nu`` never exceeds its rate.
+
     Args:
         distance: mean squared normalised distance ``D``, of any shape; infinite is allowed.
         nu: degrees of freedom, of the same shape.
-        rate_nu: rate of the degrees of freedom, in [0, 1].
+        rate_nu: rate of the degrees of freedom, in [0, 1]; 0 keeps them.
         k: lower bound of the degrees of freedom; infinite switches the robustness off (share 1, ``nu`` unchanged).
         eps: margin over the bound.
 
@@ -43,12 +49,11 @@ def robust_rate(distance: Tensor, nu: Tensor, rate_nu: float, k: float, eps: flo
     """
     if math.isinf(k):
         return torch.ones_like(nu), nu
-    tiny = torch.finfo(nu.dtype).tiny
     one_more = nu + 1
-    weight = (one_more / (nu + distance)).clamp_(min=tiny)  # its logarithm is finite
+    weight = (one_more / (nu + distance)).clamp_(min=_TINY)
     largest = one_more / nu
     w_nu = weight - weight.log()
-    w_nu_max = (largest - largest.log()).clamp_(min=-math.log(tiny))
+    w_nu_max = (largest - largest.log()).clamp_(min=-math.log(_TINY))
     # w_nu (nu* - nu), with (nu + 2) / (nu + 1) + nu = (nu + 1) + 1 / (nu + 1)
     pull = one_more.add_(one_more.reciprocal()).mul_(1 - k / nu).addcmul_(w_nu, (k + eps) - nu)
     return weight.div_(largest), torch.addcdiv(nu, pull, w_nu_max, value=rate_nu)
