@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import warnings
 from collections.abc import Callable
 from typing import Any
 
@@ -15,7 +14,9 @@ from safetensors.torch import save_file
 from tensordict import TensorDict, TensorDictBase
 
 from torchrl_tsallis._io import atomic_path
+from torchrl_tsallis.data.episodes import find_episodes, has_episodes
 from torchrl_tsallis.data.policy import NumpyPolicy
+from torchrl_tsallis.data.schema import check_pairs
 
 #: Side entries that training never reads.
 LABELS = ("episode", "expert", "ep_return", "reward", "is_noise", "is_amateur")
@@ -132,43 +133,22 @@ def validate_demonstrations(demonstrations: TensorDictBase, *, action_limit: flo
     """Checks demonstrations before anything is trained on them.
 
     Args:
-        demonstrations: flat ``[N]`` with ``observation`` ``[N, O]`` and ``action`` ``[N, A]``.
+        demonstrations: flat ``[N]`` with ``observation`` and ``action``, see :mod:`torchrl_tsallis.data.schema`:
+            vectors ``[N, D]``, integers ``[N]``, images, or nested tensordicts of these.
         action_limit: largest magnitude of an action in its space. Default: not checked.
 
     Raises:
         KeyError: if a key is missing.
-        TypeError: if the dtypes are mixed.
-        ValueError: for shapes, non-finite rows, or too few samples; the message names key and rows.
+        TypeError: if the floating-point dtypes are mixed, or an entry is no tensor of real numbers.
+        ValueError: for shapes, non-finite rows, too few samples, or ends of episodes that contradict each other; the
+            message names key and rows.
 
     Warns:
-        UserWarning: for dimensions that never change.
+        UserWarning: for dimensions of vectors that never change. A logged notice says where data is float64.
 
     Examples:
         >>> validate_demonstrations(TensorDict({"observation": torch.rand(3, 2), "action": torch.rand(3, 1)}, [3]))
     """
-    size = len(demonstrations)
-    if size < 2:
-        raise ValueError(f"{size} samples cannot be imitated: record at least two")
-    dtypes = {}
-    for key in ("observation", "action"):
-        value = demonstrations.get(key, None)
-        if value is None:
-            raise KeyError(f"the demonstrations have no {key!r}, only {sorted(map(str, demonstrations.keys()))}")
-        if value.ndim != 2:
-            raise ValueError(f"{key!r} has shape {list(value.shape)}, needed is [{size}, dimension]: flatten it")
-        dtypes[key] = value.dtype
-        bad = (~value.isfinite().all(1)).nonzero()[:, 0].tolist()
-        if bad:
-            raise ValueError(f"{key!r} is NaN or infinite in {len(bad)} of {size} rows, first {bad[:5]}: remove them")
-        constant = (value == value[0]).all(0).nonzero()[:, 0].tolist()
-        if constant:
-            warnings.warn(f"{key!r} never changes in dimensions {constant}", stacklevel=2)
-    if len(set(dtypes.values())) > 1:
-        raise TypeError(f"mixed dtypes {dtypes}: convert the data by demonstrations.float()")
-    if action_limit is not None:
-        outside = (demonstrations["action"].abs() > action_limit).any(1).nonzero()[:, 0].tolist()
-        if outside:
-            raise ValueError(
-                f"'action' is outside of [-{action_limit}, {action_limit}] in {len(outside)} of {size} rows, first "
-                f"{outside[:5]}: clip the executed action, or record it in the space's units"
-            )
+    check_pairs(demonstrations, action_limit=action_limit)
+    if has_episodes(demonstrations):
+        find_episodes(demonstrations, open_end=True)
