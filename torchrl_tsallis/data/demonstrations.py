@@ -16,7 +16,7 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl_tsallis._io import atomic_path
 from torchrl_tsallis.data.episodes import find_episodes, has_episodes
 from torchrl_tsallis.data.policy import NumpyPolicy
-from torchrl_tsallis.data.schema import check_pairs
+from torchrl_tsallis.data.schema import check_layout, check_pairs
 
 #: Side entries that training never reads.
 LABELS = ("episode", "expert", "ep_return", "reward", "is_noise", "is_amateur")
@@ -91,10 +91,19 @@ def save_demonstrations(path: str | os.PathLike[str], demonstrations: TensorDict
 
     Raises:
         OSError: if the file cannot be written.
+        TypeError: if the metadata is nothing that JSON can hold.
+        ValueError: if the demonstrations are not ``[N]``, or a key has a dot, by which the file would nest it.
     """
+    check_layout(demonstrations)
+    try:
+        recording = json.dumps(metadata)
+    except (TypeError, ValueError) as error:
+        raise TypeError(
+            f"the metadata of {str(path)!r} is not JSON-able ({error}): convert it to plain numbers"
+        ) from error
     flat = {key: value.contiguous() for key, value in demonstrations.flatten_keys(".").items()}
     with atomic_path(path) as temporary:
-        save_file(flat, temporary, {"recording": json.dumps(metadata)})
+        save_file(flat, temporary, {"recording": recording})
 
 
 def load_demonstrations(path: str | os.PathLike[str]) -> tuple[TensorDict, dict[str, Any]]:
@@ -107,7 +116,9 @@ def load_demonstrations(path: str | os.PathLike[str]) -> tuple[TensorDict, dict[
         The demonstrations, ``[N]``, and the metadata.
 
     Raises:
-        ValueError: if the file is truncated.
+        FileNotFoundError: if it is not there.
+        OSError: if it cannot be read.
+        ValueError: if it is truncated, or holds something other than rows; the message names the file.
 
     Examples:
         >>> import tempfile
@@ -117,16 +128,36 @@ def load_demonstrations(path: str | os.PathLike[str]) -> tuple[TensorDict, dict[
         >>> data.shape, metadata
         (torch.Size([4]), {'std': 0.2})
     """
+    name = repr(str(path))
     try:
         with safe_open(path, "pt") as handle:
-            flat = {name: handle.get_tensor(name) for name in handle.keys()}  # noqa: SIM118
-            metadata = json.loads((handle.metadata() or {}).get("recording", "{}"))
+            flat = {key: handle.get_tensor(key) for key in handle.keys()}  # noqa: SIM118
+            recording = (handle.metadata() or {}).get("recording", "{}")
+    except FileNotFoundError as error:
+        raise FileNotFoundError(error.errno, f"{name} is not there: record it, or give its path") from error
     except SafetensorError as error:
-        raise ValueError(
-            f"{str(path)!r} is truncated or no safetensors file ({error}): delete it and record again"
-        ) from error
-    size = len(next(iter(flat.values())))
-    return TensorDict(flat, [size]).unflatten_keys("."), metadata
+        raise ValueError(f"{name} is truncated or no safetensors file ({error}): delete it and record again") from error
+    except OSError as error:
+        raise OSError(error.errno, f"cannot read {name} ({error}): check its permissions") from error
+    try:
+        metadata = json.loads(recording)
+    except ValueError as error:
+        raise ValueError(f"the metadata of {name} is no JSON ({error}): save the demonstrations again") from error
+    if not isinstance(metadata, dict):
+        raise ValueError(f"the metadata of {name} is {type(metadata).__name__}, needed is an object: save it again")
+    if not flat:
+        raise ValueError(f"{name} holds no tensor: record again")
+    scalars = sorted(key for key, value in flat.items() if not value.ndim)
+    if scalars:
+        raise ValueError(f"{scalars[0]!r} of {name} is a scalar, needed is one entry a row: save it as metadata")
+    lengths = {key: len(value) for key, value in sorted(flat.items())}
+    if len(set(lengths.values())) > 1:
+        raise ValueError(f"the entries of {name} have unequal lengths, {lengths}: they are no rows; record again")
+    size = next(iter(lengths.values()))
+    try:
+        return TensorDict(flat, [size]).unflatten_keys("."), metadata
+    except (KeyError, RuntimeError, ValueError) as error:
+        raise ValueError(f"the keys {sorted(flat)} of {name} nest into each other: rename one") from error
 
 
 def validate_demonstrations(demonstrations: TensorDictBase, *, action_limit: float | None = None) -> None:

@@ -26,6 +26,7 @@ from torchrl_tsallis.data.readers.base import (
     Provenance,
     RawEpisode,
     Reader,
+    naming,
     register,
 )
 from torchrl_tsallis.data.rows import is_memory_mapped
@@ -99,14 +100,19 @@ def open_reader(path: str | os.PathLike[str], options: Options | None = None, *,
     place = Path(path).expanduser()
     if format is not None and format not in READERS:
         raise ValueError(f"no format {format!r}: choose one of {', '.join(READERS)}")
-    if not place.exists():
-        raise FileNotFoundError(f"there is nothing at {str(place)!r}: give a file or folder of demonstrations")
-    if format is not None:
-        return READERS[format](place, options or Options())
-    for reader in READERS.values():
-        if reader.sniff(place):
-            return reader(place, options or Options())
-    held = f", a folder of {sorted(x.name for x in place.iterdir())[:5]}" if place.is_dir() else ""
+    try:
+        if not place.exists():
+            raise FileNotFoundError(f"there is nothing at {str(place)!r}: give a file or folder of demonstrations")
+        if format is not None:
+            return READERS[format](place, options or Options())
+        for reader in READERS.values():
+            if reader.sniff(place):
+                return reader(place, options or Options())
+        held = f", a folder of {sorted(x.name for x in place.iterdir())[:5]}" if place.is_dir() else ""
+    except PermissionError as error:
+        if "no permission" in str(error):
+            raise
+        raise PermissionError(error.errno, f"no permission to read {str(place)!r}: chmod u+rx, or copy it") from error
     raise ValueError(
         f"{str(place)!r}{held} is none of the formats that can be read ({', '.join(READERS)}): give the data set's own "
         "folder or file, or name the format"
@@ -211,8 +217,6 @@ def read_demonstrations(
             _log.warning("%s: %s are float64 and read as %s (dtype=None: as they are)", path, double, dtype)
         found = found._replace(data=as_dtype(found.data, dtype))
     if check:
-        try:
+        with naming(Path(found.source.path)):
             check_rows(found.data, ["observation", "action"])
-        except ValueError as error:
-            raise ValueError(f"{found.source.path!r}: {error}, or choose other keys") from error
     return found

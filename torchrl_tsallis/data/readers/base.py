@@ -223,6 +223,15 @@ def reading(path: Path, *, fix: str = "copy it again, or record it again") -> It
         raise ValueError(f"{str(path)!r} is truncated or broken ({reason}): {fix}") from error
 
 
+@contextmanager
+def naming(path: Path) -> Iterator[None]:
+    """Puts the file's name before the message of a check of its rows."""
+    try:
+        yield
+    except ValueError as error:
+        raise ValueError(f"{str(path)!r}: {error}") from error
+
+
 def by_number(names: Sequence[str]) -> list[str]:
     """Sorts names by the number at their end: files sort ``episode_10`` before ``episode_2``.
 

@@ -13,7 +13,7 @@ import torch
 from tensordict import TensorDict
 
 from torchrl_tsallis.data.episodes import find_episodes
-from torchrl_tsallis.data.readers.base import Column, Options, RawEpisode, Reader, reading, register
+from torchrl_tsallis.data.readers.base import Column, Options, RawEpisode, Reader, naming, reading, register
 
 #: What entries are usually called, by role.
 NAMES = {
@@ -39,7 +39,7 @@ def cut(path: Path, flags: dict[str, np.ndarray], number: np.ndarray | None, siz
     }
     if number is not None:
         data["episode"] = torch.from_numpy(np.asarray(number).reshape(-1))
-    with reading(path, fix="correct the table"):
+    with naming(path):
         found = find_episodes(TensorDict(data, [size]), open_end=True)
     ends = found.ends.numpy()
     ended = np.zeros(len(ends), dtype=bool)

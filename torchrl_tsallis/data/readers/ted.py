@@ -22,6 +22,7 @@ from torchrl_tsallis.data.readers.base import (
     Provenance,
     RawEpisode,
     Reader,
+    naming,
     reading,
     register,
 )
@@ -121,7 +122,8 @@ class TedReader(Reader):
         """Rows of each episode."""
         if self.pairs:
             return {"0": len(self._data)}
-        found = find_episodes(self._data, open_end=True)
+        with naming(self.path):
+            found = find_episodes(self._data, open_end=True)
         number = self._data.get("episode", self._data.get(("info", "episode"), None))
         names = range(len(found.starts)) if number is None else number.reshape(-1)[found.starts].tolist()
         return dict(zip(map(str, names), found.lengths.tolist(), strict=True))
