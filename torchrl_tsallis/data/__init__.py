@@ -10,7 +10,9 @@ from torchrl_tsallis.data.demonstrations import (
     validate_demonstrations,
 )
 from torchrl_tsallis.data.episodes import Episodes, find_episodes
+from torchrl_tsallis.data.findings import Finding
 from torchrl_tsallis.data.flip_demonstrations import record_flips, replay_forces
+from torchrl_tsallis.data.hygiene import inspect_demonstrations
 from torchrl_tsallis.data.policy import NumpyPolicy, load_policy
 from torchrl_tsallis.data.replay import make_replay_buffer
 from torchrl_tsallis.data.robust_scaling import RobustScaling
@@ -23,6 +25,7 @@ from torchrl_tsallis.data.teleoperation import FlipOperator
 __all__ = [
     "TASKS",
     "Episodes",
+    "Finding",
     "FlipOperator",
     "MemberSampler",
     "NumpyPolicy",
@@ -31,6 +34,7 @@ __all__ = [
     "add_action_noise",
     "find_episodes",
     "fold_episodes",
+    "inspect_demonstrations",
     "load_demonstrations",
     "load_policy",
     "make_replay_buffer",

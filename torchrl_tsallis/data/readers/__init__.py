@@ -212,10 +212,13 @@ def read_demonstrations(
     options = Options(observation, action, reward, episode, filter_key, images, next_observation, concatenate)
     found = open_reader(path, options, format=format).read()
     if dtype is not None and not is_memory_mapped(found.data):
-        double = [key for key, value in found.data.items(True, True) if value.dtype == torch.float64]
+        info = found.data.get("info", None)
+        read = found.data.exclude("info")
+        double = [key for key, value in read.items(True, True) if value.dtype == torch.float64]
         if double and dtype != torch.float64:
             _log.warning("%s: %s are float64 and read as %s (dtype=None: as they are)", path, double, dtype)
-        found = found._replace(data=as_dtype(found.data, dtype))
+        data = as_dtype(read, dtype)
+        found = found._replace(data=data if info is None else data.set("info", info))
     if check:
         with naming(Path(found.source.path)):
             check_rows(found.data, ["observation", "action"])

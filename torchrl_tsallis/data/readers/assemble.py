@@ -174,6 +174,8 @@ def _observations(parts: dict[str, Tensor], concatenate: bool) -> tuple[Any, tup
 def _check_lengths(episode: RawEpisode, path: object) -> int:
     lengths = {key: len(value) for key, value in episode.columns.items()}
     lengths |= {f"next {key}": len(value) for key, value in episode.following.items()}
+    if episode.timestamp is not None:
+        lengths["timestamp"] = len(episode.timestamp)
     if episode.reward is not None:
         lengths["reward"] = len(episode.reward)
     if len(set(lengths.values())) > 1:
@@ -236,6 +238,8 @@ def assemble(reader: Reader) -> Demonstrations:
     if after:
         data["next"] = after
     data["info"] = {"step": step}
+    if all(episode.timestamp is not None for episode in episodes):
+        data["info"]["timestamp"] = join("timestamp", lambda episode: episode.timestamp).reshape(size).double()
     left_out = tuple(key for key in reader.columns() if key not in (*keys, reward))
     source = Provenance(
         reader.name, str(path), tuple(observation), tuple(action), layout, left_out, tuple(names), reader.facts()

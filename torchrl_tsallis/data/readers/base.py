@@ -73,6 +73,7 @@ class RawEpisode:
         reward: ``[T]``, if there is one.
         terminated: whether it ended by itself at its last step.
         following: observations after each step by key, ``[T, *]``, where they were asked for.
+        timestamp: in s, ``[T]``, if there is one.
     """
 
     name: str
@@ -80,6 +81,7 @@ class RawEpisode:
     reward: np.ndarray | None = None
     terminated: bool = False
     following: dict[str, np.ndarray] = field(default_factory=dict)
+    timestamp: np.ndarray | None = None
 
 
 @dataclass(frozen=True)
@@ -116,7 +118,7 @@ class Demonstrations(NamedTuple):
 
     Args:
         data: flat ``[N]``, see :mod:`torchrl_tsallis.data.schema`; ``("info", "step")`` counts the steps of the
-            source's episode.
+            source's episode, and ``("info", "timestamp")`` is its time in s, where there is one.
         source: where it comes from.
     """
 

@@ -190,13 +190,17 @@ class LeRobotReader(Reader):
             raise ValueError(f"{str(self.path)!r} is LeRobot, which has no next observations: leave them out")
         order, numbers, starts = self._order
         chosen = set(self._chosen)
-        read = self._read(list(dict.fromkeys([*keys, *([reward] if reward else [])])))
+        times = ["timestamp"] if "timestamp" in self._schema.names else []
+        read = self._read(list(dict.fromkeys([*keys, *times, *([reward] if reward else [])])))
         stops = [*starts[1:], len(order)]
         for number, start, stop in zip(numbers.tolist(), starts, stops, strict=True):
             if number in chosen:
                 rows = order[start:stop]
                 yield RawEpisode(
-                    str(number), {key: read[key][rows] for key in keys}, None if reward is None else read[reward][rows]
+                    str(number),
+                    {key: read[key][rows] for key in keys},
+                    None if reward is None else read[reward][rows],
+                    timestamp=read["timestamp"][rows] if times else None,
                 )
 
     def facts(self) -> dict[str, Any]:

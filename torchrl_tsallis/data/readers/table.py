@@ -23,10 +23,13 @@ NAMES = {
     "terminated": ("terminals", "terminated", "terminations", "terminal"),
     "truncated": ("timeouts", "truncated", "truncations"),
     "done": ("dones", "done"),
+    "timestamp": ("timestamp", "timestamps", "time"),
     "episode": ("episode", "episodes", "episode_index", "episode_id", "traj_id"),
 }
 _ROLES = {
-    name: {"terminated": "end", "truncated": "end", "done": "end", "episode": "index"}.get(role, role)
+    name: {"terminated": "end", "truncated": "end", "done": "end", "episode": "index", "timestamp": "index"}.get(
+        role, role
+    )
     for role, names in NAMES.items()
     for name in names
 }
@@ -108,6 +111,8 @@ class _Table(Reader):
         """Cuts the arrays into episodes."""
         arrays = {key: self._rows(key) for key in keys}
         rewards = None if reward is None else self._rows(reward)
+        clock = self._named("timestamp")
+        times = None if clock is None or self._columns[clock].shape else self._rows(clock)
         after = {key: self._following(key) for key in following}
         for name, start, length, ended in self._cuts:
             part = slice(start, start + length)
@@ -117,6 +122,7 @@ class _Table(Reader):
                 None if rewards is None else rewards[part],
                 ended,
                 {key: array[part] for key, array in after.items()},
+                None if times is None else times[part],
             )
 
     def _rows(self, key: str) -> np.ndarray:
