@@ -103,10 +103,25 @@ def test_a_folder_that_cannot_be_used(tmp_path, monkeypatch):
     def full(*_):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(module, "_fill", full)
+    monkeypatch.setattr(module.os, "posix_fallocate", full)
     with pytest.raises(OSError, match="No space left.*MiB are free"):
         make_replay_buffer(demonstrations(), batch_size=8, scratch_dir=tmp_path / "new")
     assert not list((tmp_path / "new").iterdir())
+
+
+def test_a_full_temporary_folder(tmp_path, monkeypatch):
+    mapped = on_disk(tmp_path / "data", demonstrations())
+    (tmp_path / "tmp").mkdir()
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "tmp"))
+    monkeypatch.setattr(module, "PIECE", 64)
+
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(module.os, "posix_fallocate", full)
+    with pytest.raises(OSError, match="No space left.*TMPDIR"):
+        split_episodes(mapped, 0.5)
+    assert not list((tmp_path / "tmp").iterdir())
 
 
 def test_pieces_change_nothing(tmp_path, monkeypatch):

@@ -9,12 +9,16 @@ import pytest
 import torch
 from tensordict import TensorDict
 
+from torchrl_tsallis import AdaTerm, CATSoftUpdate, TsallisBCLoss
 from torchrl_tsallis.data import (
     make_replay_buffer,
     make_sequence_buffer,
     make_stacked_replay_buffer,
+    storage,
     validate_demonstrations,
 )
+from torchrl_tsallis.modules import make_policy
+from torchrl_tsallis.trainers import make_offline_trainer
 
 
 def rows(n: int = 8, **other) -> TensorDict:
@@ -122,3 +126,19 @@ def test_sizes_that_are_none(size):
         make_stacked_replay_buffer(rows(), batch_size=size, seeds=[0])
     with pytest.raises(ValueError, match=f"slice_len={size}"):
         make_sequence_buffer(rows(), slice_len=size, num_slices=1)
+
+
+@pytest.mark.parametrize("double", [False, True])
+def test_a_trainer_gives_its_loss_the_dtype_of_its_weights(double, caplog):
+    storage._notice.cache_clear()
+    torch.manual_seed(0)
+    data = rows(32).apply(lambda x: x.double())
+    loss = TsallisBCLoss(make_policy(3, 2, hidden=(8,)))
+    loss = loss.double() if double else loss
+    buffer = make_replay_buffer(data, batch_size=8)
+    make_offline_trainer(
+        loss, buffer, AdaTerm(loss.parameters()), updater=CATSoftUpdate(loss), steps=2, log_every=1, progress=False
+    ).train()
+    assert all(p.isfinite().all() for p in loss.parameters())
+    assert ("the loss is float32: batches are converted" in caplog.text) != double
+    assert buffer.sample()["action"].dtype == torch.float64

@@ -60,9 +60,21 @@ def is_memory_mapped(data: TensorDictBase) -> bool:
     return bool(leaves) and all(isinstance(leaf, MemoryMappedTensor) for leaf in leaves)
 
 
+def _on_disk(data: TensorDictBase) -> bool:
+    """Whether some entry lies in a memory map, and the rows are more than a piece."""
+    mapped = any(isinstance(leaf, MemoryMappedTensor) for leaf in data.values(True, True))
+    return mapped and row_bytes(data) * len(data) > PIECE
+
+
 def _allocate(row: TensorDictBase, size: int, folder: str | None) -> TensorDictBase:
     """An empty memory map ``[size]`` of rows like ``row`` ``[1]``; without a folder in shared memory."""
-    return TensorDict(row.to_dict(), [1]).expand(size).memmap_like(prefix=folder)
+    out = TensorDict(row.to_dict(), [1]).expand(size).memmap_like(prefix=folder)
+    if folder is not None and hasattr(os, "posix_fallocate"):
+        for file in Path(folder).rglob("*.memmap"):  # a full disk is an error now, and a killed process later
+            with file.open("r+b") as handle:
+                if length := os.fstat(handle.fileno()).st_size:
+                    os.posix_fallocate(handle.fileno(), 0, length)
+    return out
 
 
 def _copy(source: TensorDictBase, target: TensorDictBase, start: int) -> None:
@@ -99,7 +111,7 @@ def _kept(folder: Path, parts: Sequence[TensorDictBase], like: TensorDictBase, s
         try:
             old = TensorDict.load_memmap(found, allow_pickle=False)
             shapes = {key: (value.shape[1:], value.dtype) for key, value in old.items(True, True)}
-        except Exception:  # noqa: BLE001, S112: whatever lies there, it is not what this function wrote
+        except Exception:  # whatever lies there, it is not what this function wrote
             continue
         wanted = {key: (value.shape[1:], value.dtype) for key, value in like.items(True, True)}
         if old.shape != (size,) or shapes != wanted:
@@ -194,7 +206,7 @@ def map_rows(function: Callable[[TensorDictBase], TensorDictBase], data: TensorD
     Raises:
         OSError: if the temporary folder has no room; ``TMPDIR`` chooses another disk.
     """
-    if not is_memory_mapped(data) or data.ndim != 1 or row_bytes(data) * len(data) <= PIECE:
+    if data.ndim != 1 or not _on_disk(data):
         return function(data)
     return _temporary(function(data[:1]), len(data), lambda part: function(data[part]), row_bytes(data))
 
@@ -212,7 +224,7 @@ def take_rows(data: TensorDictBase, mask: Tensor) -> TensorDictBase:
     Raises:
         OSError: if the temporary folder has no room; ``TMPDIR`` chooses another disk.
     """
-    if not is_memory_mapped(data) or row_bytes(data) * len(data) <= PIECE:
+    if not _on_disk(data):
         return data[mask]
     rows = mask.nonzero()[:, 0]
     return _temporary(data[:1], len(rows), lambda part: data[rows[part]], row_bytes(data))

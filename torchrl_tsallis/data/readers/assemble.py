@@ -12,6 +12,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from torchrl_tsallis.data.readers.base import Column, Demonstrations, Provenance, RawEpisode, Reader
+from torchrl_tsallis.data.rows import map_rows
 
 
 def choose(columns: dict[str, Column], wanted: Iterable[str], what: str, path: object) -> list[str]:
@@ -138,10 +139,14 @@ def concatenate_observations(
         width = _vector(nested[key]).shape[1]
         layout.append((key, start, start + width))
         start += width
-    out.set("observation", _side_by_side([nested[key] for key in chosen]))
-    following = demonstrations.get(("next", "observation"), None)
-    if following is not None:
-        out.set(("next", "observation"), _side_by_side([following[key] for key in chosen]))
+    for place in ("observation", ("next", "observation")):
+        parts = demonstrations.get(place, None)
+        if parts is not None:
+            whole = map_rows(
+                lambda rows: TensorDict({"all": _side_by_side([rows[key] for key in chosen])}, rows.shape),
+                parts.select(*chosen),
+            )
+            out.set(place, whole["all"])
     return out, tuple(layout)
 
 

@@ -216,8 +216,10 @@ def reading(path: Path, *, fix: str = "copy it again, or record it again") -> It
         raise PermissionError(error.errno, f"no permission to read {str(path)!r}: chmod u+r, or copy it") from error
     except FileNotFoundError as error:
         raise FileNotFoundError(error.errno, f"{str(path)!r} is not there: {fix}") from error
-    except (KeyboardInterrupt, MemoryError):
-        raise
+    except MemoryError as error:
+        raise MemoryError(
+            f"{str(path)!r} does not fit into memory ({error}): choose fewer keys, or copy it again if it is no such size"
+        ) from error
     except Exception as error:
         if isinstance(error, ValueError) and str(path) in str(error):
             raise

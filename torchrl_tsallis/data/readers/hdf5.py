@@ -36,14 +36,25 @@ def open_hdf5(path: Path) -> Iterator[Any]:
             pass  # h5py calls every failure an OSError; the operating system says which
         handle = h5py.File(path, "r")
     with handle:
-        yield handle
+        try:
+            yield handle
+        except KeyError as error:
+            if str(path) in str(error):  # a reader's own
+                raise
+            raise ValueError(f"{str(path)!r} is truncated or broken ({error}): copy it again") from error
+        except (OSError, RuntimeError) as error:  # h5py's, of what is broken below the file's head
+            raise ValueError(
+                f"{str(path)!r} is truncated or broken ({error}): copy it again, or record it again"
+            ) from error
 
 
 def datasets(group: Any, prefix: str = "") -> dict[str, Any]:
     """All datasets below a group, by path."""
     out: dict[str, Any] = {}
     for name in group:
-        item = group[name]
+        item = group.get(name)
+        if item is None:  # a link to nowhere
+            continue
         out.update(datasets(item, f"{prefix}{name}/") if hasattr(item, "keys") else {f"{prefix}{name}": item})
     return out
 

@@ -98,8 +98,13 @@ class TedReader(Reader):
     def __init__(self, path: Path, options: Options) -> None:
         super().__init__(path, options)
         self._data = load_rows(path)
-        if self._data.ndim != 1:
+        if self._data.ndim == 2:  # episodes of one length
+            count, length = self._data.shape
             self._data = self._data.reshape(-1)
+            if not has_episodes(self._data):
+                self._data.set("episode", torch.arange(count).repeat_interleave(length))
+        if self._data.ndim != 1:
+            raise ValueError(f"{str(path)!r} has the batch size {list(self._data.shape)}, needed is [N]: save it flat")
         self._keys: dict[str, NestedKey] = {
             key if isinstance(key, str) else ".".join(key): key for key in self._data.keys(True, True)
         }
