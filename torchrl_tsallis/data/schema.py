@@ -2,18 +2,18 @@
 
 Demonstrations are a flat tensordict ``[N]``, one row a time step, in TorchRL's episode format (TED):
 
-==================================  ==================  ===============================================================
-key                                 shape               meaning
-==================================  ==================  ===============================================================
-``observation``                     ``[N, *O]``         of any shape and dtype, or a nested tensordict of several
-``action``                          ``[N, *A]``         ``[N]`` where it is one integer a step
-``("next", "observation")``         ``[N, *O]``         optional
-``("next", "reward")``              ``[N, 1]``          optional, for comparisons; training never reads it
-``("next", "done")``                ``[N]``, ``[N, 1]`` the episode's last step; likewise ``terminated``, ``truncated``
-``is_init``                         ``[N]``, ``[N, 1]`` the episode's first step
-``episode``                         ``[N]``, ``[N, 1]`` number of the episode
-``info``                            nested              labels and whatever else training must never read
-==================================  ==================  ===============================================================
+===========================  ===================  ===========================================================
+key                          shape                meaning
+===========================  ===================  ===========================================================
+``observation``              ``[N, *O]``          of any shape and dtype, or a nested tensordict of several
+``action``                   ``[N, *A]``          ``[N]`` where it is one integer a step
+``("next", "observation")``  ``[N, *O]``          optional
+``("next", "reward")``       ``[N, 1]``           optional, for comparisons; training never reads it
+``("next", "done")``         ``[N]``, ``[N, 1]``  the episode's last step; also ``terminated``, ``truncated``
+``is_init``                  ``[N]``, ``[N, 1]``  the episode's first step
+``episode``                  ``[N]``, ``[N, 1]``  number of the episode
+``info``                     nested               labels and whatever else training must never read
+===========================  ===================  ===========================================================
 
 Rows of an episode follow one another. An episode ends where ``done``, ``terminated`` or ``truncated`` is set, where
 ``episode`` changes, before a row with ``is_init``, and at the last row. Each may be missing, but none may contradict

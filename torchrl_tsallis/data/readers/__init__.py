@@ -11,11 +11,12 @@ from typing import Any
 
 import torch
 
-# The order in which formats look at a path is that of these imports.
+# Each import registers a format; a path looks like one of them at most.
 from torchrl_tsallis.data.readers import lerobot as _lerobot  # noqa: F401
 from torchrl_tsallis.data.readers import minari as _minari  # noqa: F401
+from torchrl_tsallis.data.readers import npz as _npz  # noqa: F401
 from torchrl_tsallis.data.readers import robomimic as _robomimic  # noqa: F401
-from torchrl_tsallis.data.readers import table as _table  # noqa: F401, I001
+from torchrl_tsallis.data.readers import table as _table  # noqa: F401
 from torchrl_tsallis.data.readers import ted as _ted  # noqa: F401
 from torchrl_tsallis.data.readers.assemble import concatenate_observations
 from torchrl_tsallis.data.readers.base import (

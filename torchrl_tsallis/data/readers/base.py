@@ -218,7 +218,7 @@ def reading(path: Path, *, fix: str = "copy it again, or record it again") -> It
         raise FileNotFoundError(error.errno, f"{str(path)!r} is not there: {fix}") from error
     except MemoryError as error:
         raise MemoryError(
-            f"{str(path)!r} does not fit into memory ({error}): choose fewer keys, or copy it again if it is no such size"
+            f"{str(path)!r} does not fit into memory ({error}): choose fewer keys, or copy it again"
         ) from error
     except Exception as error:
         if isinstance(error, ValueError) and str(path) in str(error):
