@@ -71,18 +71,35 @@ def almost_still(kind: str) -> torch.Tensor:
         value[::3] = torch.nextafter(value[::3], torch.ones(()))
     if kind == "three roundings":
         value[::2] += 3 * 2**-25
+    if kind == "noise of some roundings":
+        value += 1e-6 * torch.randn(1000, generator=torch.Generator().manual_seed(0))
+    if kind == "one step of some roundings":
+        value[7] += 1e-6
+    if kind == "numerical noise about zero":
+        value = 1e-17 * torch.randn(1000, generator=torch.Generator().manual_seed(0))
     if kind == "rounding of a large number":
         value = 1e6 + value
         value[::7] += 0.0625
     return value
 
 
-@pytest.mark.parametrize("kind", ["constant", "one rounding", "three roundings", "rounding of a large number"])
+STILL = (
+    "constant",
+    "one rounding",
+    "three roundings",
+    "rounding of a large number",
+    "noise of some roundings",
+    "one step of some roundings",
+    "numerical noise about zero",
+)
+
+
+@pytest.mark.parametrize("kind", STILL)
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("fit", [RobustScaling.fit, lambda data: Scaling.fit(data, action_unit=1.0)])
 def test_a_sensor_that_moves_by_rounding_is_only_centred(kind, dtype, fit):
     value = almost_still(kind)
-    observation = torch.stack([torch.randn(1000), value], 1).to(dtype)
+    observation = torch.stack([torch.randn(1000), value, torch.randn(1000)], 1).to(dtype)
     data = TensorDict({"observation": observation, "action": torch.rand(1000, 1, dtype=dtype)}, [1000])
     scaling = fit(data)
     deployed = TensorDict({"observation": observation[:1] + 0.01, "action": data["action"][:1]}, [1])
@@ -108,6 +125,12 @@ def test_what_rests_most_of_the_time_falls_back_in_the_documented_order(share, n
     centre, scale = robust_statistics(value)
     assert scale.item() == pytest.approx(expected, rel=1e-3)
     assert ((value - centre) / scale).abs().max() < 17
+
+
+def test_tiny_units_beside_a_constant_are_units():
+    value = torch.stack([1e-12 * torch.randn(1000), torch.full((1000,), 3e-12), torch.full((1000,), 7.0)], 1)
+    _, scale = robust_statistics(value)
+    assert 0.8e-12 < scale[0] < 1.2e-12 and scale[1:].tolist() == [1.0, 1.0]
 
 
 def test_long_data_is_taken_in_pieces_with_the_same_result(monkeypatch):

@@ -57,7 +57,7 @@ def _extremes(value: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
 
 
 def find_constant(demonstrations: TensorDictBase, keys: Sequence[NestedKey] = _KEYS) -> list[Finding]:
-    """Dimensions that never change, or only by rounding (16 roundings of float32)."""
+    """Dimensions that never change, or only by rounding (64 roundings of float32)."""
     out = []
     for key, value in vectors(demonstrations, keys).items():
         least, most, _, _ = _extremes(value)

@@ -14,7 +14,7 @@ from torchrl_tsallis.data.rows import PIECE, map_rows, pieces, row_bytes
 from torchrl_tsallis.data.schema import leaves
 
 #: A spread below so many float32 roundings of the values themselves is no signal.
-ROUNDINGS = 16 * torch.finfo(torch.float32).eps
+ROUNDINGS = 64 * torch.finfo(torch.float32).eps
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ class Scaling:
     def fit(cls, demonstrations: TensorDictBase, *, action_unit: float) -> Scaling:
         """Takes mean and (biased) deviation from demonstrations ``[N]``; what is constant is only centred.
 
-        Constant is also what deviates by less than 16 roundings of float32.
+        Constant is also what deviates by less than 64 roundings of float32.
 
         Raises:
             KeyError: if there is no observation.
