@@ -181,6 +181,34 @@ def test_broken_rows_name_file_key_and_row(write_v21, tmp_path):
         read_demonstrations(folder)
 
 
+def test_metadata_of_the_wrong_kind(write_v21, tmp_path):
+    folder = write_v21(tmp_path / "data")
+    file = folder / "meta" / "info.json"
+    info = json.loads(file.read_text())
+    for change, message in [
+        ([], "info.json' is truncated or broken .it is list"),
+        (info | {"features": ["action"]}, "'features' of .*info.json' must be an object of objects"),
+        (info | {"features": {"observation.images.cam": {"dtype": "video", "shape": "wide"}, "action": 3}}, "objects"),
+        (info | {"features": {"action": {"dtype": "image", "shape": ["a"]}}}, "info.json' is truncated or broken"),
+        (info | {"splits": {"train": "all"}}, r"split 'train' of .*info.json' is 'all', needed is 'from:to'"),
+    ]:
+        file.write_text(json.dumps(change))
+        with pytest.raises(ValueError, match=message):
+            read_demonstrations(folder, filter_key="train")
+    file.write_text(json.dumps(info))
+    lines = folder / "meta" / "episodes.jsonl"
+    lines.write_text(lines.read_text() + '{"episode_index": 3, "length": 0}\n')
+    with pytest.raises(ValueError, match="episode 3 of .* is empty"):
+        read_demonstrations(folder)
+    lines.write_text("[]\n")
+    with pytest.raises(ValueError, match=r"episodes.jsonl' is truncated or broken"):
+        read_demonstrations(folder)
+    for parquet in folder.glob("data/**/*.parquet"):
+        pq.write_table(pq.read_table(parquet).slice(0, 0), parquet)
+    with pytest.raises(ValueError, match="holds no row"):
+        read_demonstrations(folder)
+
+
 def test_free_names(write_v21, tmp_path):
     folder = write_v21(tmp_path / "data")
     for file in folder.glob("data/**/*.parquet"):

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 
+from torchrl_tsallis.data import RobustScaling, make_replay_buffer, split_episodes
 from torchrl_tsallis.data.readers import (
     READERS,
     Column,
@@ -21,6 +22,7 @@ from torchrl_tsallis.data.readers import (
     register,
 )
 from torchrl_tsallis.data.readers import base as module
+from torchrl_tsallis.modules import make_policy
 
 
 def test_every_format_is_found_and_described(write_robomimic, write_minari, write_v21, tmp_path):
@@ -162,3 +164,20 @@ def test_concatenated_observations_have_a_layout():
         concatenate_observations(data, ["c"])
     with pytest.raises(ValueError, match="one tensor already"):
         concatenate_observations(out)
+
+
+def test_from_a_file_to_the_same_densities_in_any_unit(write_robomimic, tmp_path):
+    file = write_robomimic(tmp_path / "a.hdf5", {f"demo_{k}": 20 for k in range(6)})
+    densities = []
+    for unit in (1.0, 1e-3, 1e3):
+        data, _ = read_demonstrations(file)
+        generator = torch.Generator().manual_seed(0)
+        noise = torch.randn(data["action"].shape, generator=generator)
+        data["action"] = unit * (data["observation"][:, :2] + noise)
+        training, _ = split_episodes(data, 0.2, seed=1)
+        batch = make_replay_buffer(RobustScaling.fit(training)(training), batch_size=32).sample()
+        torch.manual_seed(0)
+        policy = make_policy(4, 2, hidden=(8,))
+        densities.append(policy.get_dist(batch).log_prob(batch["action"]))
+    torch.testing.assert_close(densities[1], densities[0], rtol=1e-4, atol=1e-4)
+    torch.testing.assert_close(densities[2], densities[0], rtol=1e-4, atol=1e-4)

@@ -87,6 +87,17 @@ def test_broken_episodes_are_named(write_robomimic, tmp_path, key, value, error,
         read_demonstrations(file)
 
 
+def test_strange_groups_are_passed_over(write_robomimic, tmp_path):
+    file = write_robomimic(tmp_path / "data.hdf5")
+    with h5py.File(file, "a") as handle:
+        handle["data/notes"] = np.zeros(3)
+        handle["mask/nested/deeper"] = np.zeros(3)
+        handle["data/demo_2/obs/nowhere"] = h5py.SoftLink("/gone")
+        handle["data"].attrs["env_args"] = "free text"
+    data, source = read_demonstrations(file)
+    assert len(data) == 12 and source.facts["env"] is None and "nested" not in source.facts["masks"]
+
+
 def test_empty_and_truncated_files(write_robomimic, tmp_path):
     file = write_robomimic(tmp_path / "data.hdf5")
     whole = file.read_bytes()

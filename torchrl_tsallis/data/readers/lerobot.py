@@ -45,12 +45,16 @@ class LeRobotReader(Reader):
         file = path / "meta" / "info.json"
         with reading(file):
             self._info = json.loads(file.read_text())
+            if not isinstance(self._info, dict):
+                raise ValueError(f"it is {type(self._info).__name__}, not an object")
         version = str(self._info.get("codebase_version", "none"))
         if not version.startswith(("v2.1", "v3.")):
             fix = next((f"convert it by {c}" for old, c in _CONVERTERS.items() if version.startswith(old)), None)
             fix = fix or "update torchrl-tsallis, or convert the data to v3.0 by LeRobot"
             raise ValueError(f"{str(path)!r} is LeRobot {version}; v2.1 and v3.x can be read: {fix}")
         self._features: dict[str, Any] = self._info.get("features") or {}
+        if not isinstance(self._features, dict) or not all(isinstance(x, dict) for x in self._features.values()):
+            raise ValueError(f"'features' of {str(file)!r} must be an object of objects: write the metadata again")
         self._files = sorted(path.glob("data/**/*.parquet"))
         if not self._files:
             raise FileNotFoundError(f"{str(path)!r} has no data/**/*.parquet: download the data beside the metadata")
@@ -62,7 +66,8 @@ class LeRobotReader(Reader):
         for key, (shape, kind, readable) in columns_of(self._schema).items():
             described = self._features.get(key, {})
             image = is_binary(kind) or described.get("dtype") in ("image", "video")
-            named = [int(x) for x in described.get("shape", ())]
+            with reading(self.path / "meta" / "info.json"):
+                named = [int(x) for x in described.get("shape", ())]
             shape = tuple(named) if image or (shape and -1 in shape) else shape
             out[key] = Column(shape, str(described.get("dtype", kind)), _role(key), image, readable)
         for key, described in self._features.items():
@@ -104,6 +109,8 @@ class LeRobotReader(Reader):
             if len(shapes) > 1:
                 where = {str(shape): file.name for shape, file in shapes.items()}
                 raise ValueError(f"{key!r} of {str(self.path)!r} differs in shape between files, {where}: leave it out")
+            if not shapes:
+                raise ValueError(f"{str(self.path)!r} holds no row: nothing was recorded")
         return {key: np.concatenate([part for part in arrays if len(part)]) for key, arrays in parts.items()}
 
     @cached_property
@@ -171,6 +178,10 @@ class LeRobotReader(Reader):
         if self._table:
             for number in sorted(found.keys() | self._table.keys()):
                 said, there = self._table.get(number, {}).get("length"), found.get(number)
+                if not said and not there:
+                    raise ValueError(
+                        f"episode {number} of {str(self.path)!r} is empty: delete it by LeRobot's own tools"
+                    )
                 if said != there:
                     raise ValueError(
                         f"episode {number} of {str(self.path)!r} has {there or 'no'} rows, its table under meta says "

@@ -54,14 +54,14 @@ class RobomimicReader(Reader):
     def _chosen(self, file: Any) -> list[str]:
         if "data" not in file or not hasattr(file["data"], "keys"):
             raise ValueError(f"{str(self.path)!r} has no group 'data', only {sorted(file)}: it is not robomimic's")
-        names = by_number(list(file["data"]))
+        names = by_number([name for name in file["data"] if hasattr(file["data"].get(name), "keys")])
         key = self.options.filter_key
         if key is None:
             return names
-        if "mask" not in file or key not in file["mask"]:
-            there = sorted(file["mask"]) if "mask" in file else []
-            raise KeyError(f"{str(self.path)!r} has no filter key {key!r}, only {there}")
-        listed = {name.decode() if isinstance(name, bytes) else str(name) for name in file["mask"][key][()]}
+        masks = _masks(file)
+        if key not in masks:
+            raise KeyError(f"{str(self.path)!r} has no filter key {key!r}, only {sorted(masks)}")
+        listed = set(masks[key])
         unknown = sorted(listed - set(names))
         if unknown:
             raise ValueError(
@@ -76,9 +76,7 @@ class RobomimicReader(Reader):
         return len(group["actions"])
 
     def _read_facts(self, file: Any) -> dict[str, Any]:
-        facts: dict[str, Any] = {"masks": {}}
-        for key in file.get("mask", {}):
-            facts["masks"][key] = [str(x.decode() if isinstance(x, bytes) else x) for x in file["mask"][key][()]]
+        facts: dict[str, Any] = {"masks": _masks(file)}
         try:
             facts["env"] = json.loads(file["data"].attrs.get("env_args", "{}")).get("env_name")
         except (ValueError, AttributeError, TypeError):
@@ -113,6 +111,17 @@ class RobomimicReader(Reader):
                     after[key] = value(group, f"next_{key}", name, self.path)
                 dones = np.asarray(group["dones"][()]).reshape(-1) if "dones" in group else np.zeros(1)
                 yield RawEpisode(name, read, rewards, bool(len(dones) and dones[-1]), after)
+
+
+def _masks(file: Any) -> dict[str, list[str]]:
+    """The episodes that each filter key lists."""
+    group = file.get("mask", {})
+    lists = {key: group.get(key) for key in group} if hasattr(group, "keys") else {}
+    return {
+        key: [x.decode(errors="replace") if isinstance(x, bytes) else str(x) for x in np.asarray(item[()]).reshape(-1)]
+        for key, item in lists.items()
+        if item is not None and not hasattr(item, "keys")
+    }
 
 
 def _role(key: str) -> str:
