@@ -97,7 +97,7 @@ def write_minari(tmp_path, monkeypatch):
                     rewards=[float(step) for step in range(size)],
                     terminations=list(last & (end == 0)),
                     truncations=list(last & (end == 1)),
-                    infos={"speed": np.arange(size + 1.0)} if infos and data_format == "hdf5" else None,
+                    infos={"speed": np.arange(size + 1.0)} if infos else None,
                 )
             )
         with warnings.catch_warnings():

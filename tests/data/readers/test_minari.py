@@ -15,7 +15,7 @@ from torchrl_tsallis.data.readers import describe, read_demonstrations
 LENGTHS = [3 + k % 4 for k in range(12)]
 
 
-@pytest.mark.parametrize("data_format", ["hdf5", "arrow"])
+@pytest.mark.parametrize("data_format", ["hdf5", "arrow", "parquet"])
 def test_vectors_in_the_order_of_the_numbers(write_minari, data_format):
     folder = write_minari("box", data_format)
     data, source = read_demonstrations(folder, next_observation=True)
@@ -63,8 +63,10 @@ def test_images_are_decoded_only_where_they_are_asked_for(write_minari, data_for
     assert (data["observation"][data["episode"] == 5].float() - 100).abs().max() < 4  # JPEG
 
 
-def test_infos_are_entries_too(write_minari):
-    data, source = read_demonstrations(write_minari(), observation=["observations", "infos/speed"])
+@pytest.mark.parametrize("data_format", ["hdf5", "arrow", "parquet"])
+def test_infos_are_entries_too(write_minari, data_format):
+    folder = write_minari("box", data_format)
+    data, source = read_demonstrations(folder, observation=["observations", "infos/speed"])
     assert data["observation"].shape == (54, 4)
     assert torch.equal(data["observation"][:, 3], data["info", "step"].float())
 
@@ -118,5 +120,5 @@ def test_broken_arrow(write_minari):
         with pytest.raises(ValueError, match=r"4/part-0.arrow' is truncated or broken"):
             read_demonstrations(folder)
     file.unlink()
-    with pytest.raises(FileNotFoundError, match="episode '4' of .* has no .arrow file"):
+    with pytest.raises(FileNotFoundError, match="episode '4' of .* has no .arrow or .parquet file"):
         read_demonstrations(folder)

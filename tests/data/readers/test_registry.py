@@ -181,3 +181,25 @@ def test_from_a_file_to_the_same_densities_in_any_unit(write_robomimic, tmp_path
         densities.append(policy.get_dist(batch).log_prob(batch["action"]))
     torch.testing.assert_close(densities[1], densities[0], rtol=1e-4, atol=1e-4)
     torch.testing.assert_close(densities[2], densities[0], rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("options", "error", "message"),
+    [
+        ({"observation": 3}, TypeError, "observation=3 must be a key"),
+        ({"observation": [1, 2]}, TypeError, r"observation=\[1, 2\] must be"),
+        ({"action": {"a": 1}}, TypeError, "action="),
+        ({"reward": ["r"]}, TypeError, "reward="),
+        ({"action": []}, KeyError, r"action=\[\] names no entry"),
+        ({"observation": []}, KeyError, "name its keys"),
+        ({"observation": "next*"}, KeyError, "no 'next[*]' for the observation"),
+        ({"reward": "return"}, KeyError, "no 'return' for the reward"),
+        ({"filter_key": "train"}, ValueError, "npz, which has no filter_key"),
+        ({"next_observation": True}, KeyError, "no 'next_obs'"),
+        ({"format": "csv"}, ValueError, "broken"),
+    ],
+)
+def test_options_that_do_not_fit(tmp_path, options, error, message):
+    np.savez(tmp_path / "a.npz", obs=np.zeros((4, 1)), acts=np.zeros((4, 1)))
+    with pytest.raises(error, match=message):
+        read_demonstrations(tmp_path / "a.npz", **options)

@@ -11,7 +11,11 @@ from torchrl_tsallis.data.readers.base import need, reading
 
 
 def open_arrow(path: Path) -> Any:
-    """Memory-maps an Arrow file as a table."""
+    """Memory-maps an Arrow file as a table, or reads a Parquet file."""
+    if path.suffix == ".parquet":
+        file = open_parquet(path)
+        with reading(path):
+            return file.read()
     arrow = need("pyarrow", path)
     ipc = need("pyarrow.ipc", path)
     with reading(path):

@@ -57,6 +57,8 @@ def _keys(reader: Reader) -> tuple[list[str], list[str], str | None]:
     if options.action is not None:
         action = [options.action] if isinstance(options.action, str) else list(options.action)
         action = choose(columns, action, "action", path)
+        if not action:
+            raise KeyError(f"action=[] names no entry of {str(path)!r}: name one or more of {sorted(columns)}")
     else:
         action = roles["action"]
         if not action or (len(action) > 1 and not reader.columns_of_one):

@@ -43,6 +43,17 @@ class Options:
     next_observation: bool = False
     concatenate: bool = True
 
+    def __post_init__(self) -> None:
+        """Raises for keys that are no text."""
+        for name in ("observation", "action"):
+            given = getattr(self, name)
+            listed = [] if given is None else [given] if isinstance(given, str) else given
+            if not isinstance(listed, Sequence) or not all(isinstance(key, str) for key in listed):
+                raise TypeError(f"{name}={given!r} must be a key of the file, or a list of keys")
+        for name in ("reward", "episode", "filter_key"):
+            if not isinstance(getattr(self, name), (str, type(None))):
+                raise TypeError(f"{name}={getattr(self, name)!r} must be a key of the file")
+
 
 @dataclass(frozen=True)
 class Column:

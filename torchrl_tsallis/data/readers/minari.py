@@ -1,4 +1,4 @@
-"""Minari: a folder with ``data/metadata.json`` and HDF5 or Arrow files."""
+"""Minari: a folder with ``data/metadata.json`` and HDF5, Arrow or Parquet files."""
 
 from __future__ import annotations
 
@@ -175,17 +175,21 @@ def _encoded(key: str, dataset: Any) -> bool:
 
 
 class _Arrow:
-    """Folders ``<i>`` with ``part-0.arrow``, a row a step and one more."""
+    """Folders ``<i>`` with ``part-0.arrow`` or ``part-0.parquet``, a row a step and one more."""
 
     def __init__(self, folder: Path) -> None:
         self.path = folder
         names = by_number([x.name for x in folder.iterdir() if x.is_dir() and x.name.isdigit()])
-        self.files = {name: sorted((folder / name).glob("*.arrow")) for name in names}
+        self.files = {
+            name: sorted((folder / name).glob("*.arrow")) or sorted((folder / name).glob("*.parquet")) for name in names
+        }
         self.lengths: dict[str, int] = {}
         self.columns: dict[str, Column] = {}
         for name, files in self.files.items():
             if not files:
-                raise FileNotFoundError(f"episode {name!r} of {str(folder)!r} has no .arrow file: copy it again")
+                raise FileNotFoundError(
+                    f"episode {name!r} of {str(folder)!r} has no .arrow or .parquet file: copy it again"
+                )
             described = folder / name / "metadata.json"
             table = open_arrow(files[0])
             steps = sum(open_arrow(file).num_rows for file in files) - 1

@@ -159,7 +159,7 @@ class TedReader(Reader):
         action = "action" if options.action is None else options.action
         actions = choose(columns, [action] if isinstance(action, str) else list(action), "action", self.path)
         if actions != ["action"]:
-            if len(actions) > 1:
+            if len(actions) != 1:
                 raise ValueError(f"{str(self.path)!r}: name one action, got {actions}")
             data.set("action", data[self._keys[actions[0]]])
         if not chosen:
