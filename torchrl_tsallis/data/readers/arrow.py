@@ -97,12 +97,15 @@ def array_of(table: Any, key: str, path: Path, name: str | None = None) -> Any:
         if not any(field.name == part for field in chunked.type):
             raise KeyError(f"{str(path)!r} has no {key!r}, which others have: leave the key out")
         chunked = need("pyarrow.compute", path).struct_field(chunked, part)
-    if chunked.null_count:
-        row = next(k for k, x in enumerate(chunked.is_null().to_pylist()) if x)
-        raise ValueError(f"{key!r} of {str(path)!r} has no value at row {row}: remove that row, or leave the key out")
-    if is_binary(chunked.type):
-        return [x["bytes"] if isinstance(x, dict) else x for x in chunked.to_pylist()]
-    parts = [_flat(chunk, key, path) for chunk in chunked.chunks if len(chunk)]
+    with reading(path):
+        if chunked.null_count:
+            row = next(k for k, x in enumerate(chunked.is_null().to_pylist()) if x)
+            raise ValueError(
+                f"{key!r} of {str(path)!r} has no value at row {row}: remove that row, or leave the key out"
+            )
+        if is_binary(chunked.type):
+            return [x["bytes"] if isinstance(x, dict) else x for x in chunked.to_pylist()]
+        parts = [_flat(chunk, key, path) for chunk in chunked.chunks if len(chunk)]
     if not parts:
         return np.zeros((0,))
     if any(part.shape[1:] != parts[0].shape[1:] for part in parts):

@@ -53,7 +53,7 @@ def datasets(group: Any, prefix: str = "") -> dict[str, Any]:
     out: dict[str, Any] = {}
     for name in group:
         item = group.get(name)
-        if item is None:  # a link to nowhere
+        if not hasattr(item, "keys") and not hasattr(item, "shape"):  # a link to nowhere, or a named type
             continue
         out.update(datasets(item, f"{prefix}{name}/") if hasattr(item, "keys") else {f"{prefix}{name}": item})
     return out
@@ -75,7 +75,7 @@ def value(group: Any, key: str, name: str, path: Path) -> np.ndarray:
         ValueError: if its bytes are broken.
     """
     item = group.get(key)
-    if item is None or hasattr(item, "keys"):
+    if item is None or not hasattr(item, "shape"):
         raise KeyError(f"episode {name!r} of {str(path)!r} has no {key!r}, which others have: leave the key out")
     with reading(path):
         return np.asarray(item[()])

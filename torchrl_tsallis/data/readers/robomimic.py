@@ -71,7 +71,7 @@ class RobomimicReader(Reader):
         return [name for name in names if name in listed]
 
     def _length(self, group: Any, name: str) -> int:
-        if "actions" not in group:
+        if not hasattr(group.get("actions"), "shape"):
             raise KeyError(f"episode {name!r} of {str(self.path)!r} has no 'actions': it was not finished; remove it")
         return len(group["actions"])
 
@@ -109,7 +109,8 @@ class RobomimicReader(Reader):
                             f"episode {name!r} of {str(self.path)!r} has no 'next_{key}': leave next_observation out"
                         )
                     after[key] = value(group, f"next_{key}", name, self.path)
-                dones = np.asarray(group["dones"][()]).reshape(-1) if "dones" in group else np.zeros(1)
+                flag = group.get("dones")
+                dones = np.asarray(flag[()]).reshape(-1) if hasattr(flag, "shape") else np.zeros(1)
                 yield RawEpisode(name, read, rewards, bool(len(dones) and dones[-1]), after)
 
 
@@ -120,7 +121,7 @@ def _masks(file: Any) -> dict[str, list[str]]:
     return {
         key: [x.decode(errors="replace") if isinstance(x, bytes) else str(x) for x in np.asarray(item[()]).reshape(-1)]
         for key, item in lists.items()
-        if item is not None and not hasattr(item, "keys")
+        if hasattr(item, "shape")
     }
 
 
