@@ -63,3 +63,14 @@ def test_errors():
         add_action_noise(data, probability=1.5)
     with pytest.raises(ValueError, match="per_expert=3"):
         replace_with_amateur(data, data, per_expert=3)
+
+
+@pytest.mark.parametrize("side", ["experts", "amateur"])
+@pytest.mark.parametrize("order", [[0, 1, 0], [1, 1, 0, 1], [2, 0, 2, 0]])
+def test_a_number_in_two_runs_of_rows_is_refused(side, order):
+    data = {"experts": demonstrations(4, 5), "amateur": demonstrations(1, 5, value=9.0)}
+    whole = demonstrations(len(order), 5)
+    whole["info", "episode"] = torch.tensor(order).repeat_interleave(5)
+    data[side] = whole
+    with pytest.raises(ValueError, match=f"trajectory {1 if 1 in order[3:] else 0} of the {side} stands in two runs"):
+        replace_with_amateur(data["experts"], data["amateur"])

@@ -7,6 +7,7 @@ import math
 import numpy as np
 import pytest
 import torch
+from safetensors.torch import save_file
 from tensordict import TensorDict
 
 from torchrl_tsallis.data.demonstrations import (
@@ -127,3 +128,43 @@ def test_a_policy_that_does_not_fit():
     tensors.pop("b3")
     with pytest.raises(ValueError, match="'b3' is missing"):
         NumpyPolicy(tensors)
+
+
+@pytest.mark.parametrize(
+    ("tensors", "metadata", "message"),
+    [
+        ({"action": torch.zeros(3, 1)}, {"recording": "{"}, "metadata of '.*data.safetensors' is no JSON"),
+        ({"action": torch.zeros(3, 1)}, {"recording": "[1]"}, "metadata of '.*data.safetensors' is list"),
+        ({}, {"recording": "{}"}, "'.*data.safetensors' holds no tensor"),
+        ({"action": torch.zeros(3, 1), "std": torch.tensor(0.2)}, {}, "'std' of '.*data.safetensors' is a scalar"),
+        (
+            {"action": torch.zeros(3, 1), "observation": torch.zeros(4, 1)},
+            {},
+            "'.*data.safetensors' have unequal lengths, {'action': 3, 'observation': 4}",
+        ),
+        ({"a": torch.zeros(3), "a.b": torch.zeros(3)}, {}, r"\['a', 'a.b'\] of '.*data.safetensors' nest"),
+    ],
+)
+def test_files_that_hold_no_rows_are_named(tmp_path, tensors, metadata, message):
+    save_file(tensors, tmp_path / "data.safetensors", metadata)
+    with pytest.raises(ValueError, match=message):
+        load_demonstrations(tmp_path / "data.safetensors")
+
+
+def test_files_that_are_not_there_or_not_files(tmp_path):
+    with pytest.raises(FileNotFoundError, match="'.*none.safetensors' is not there"):
+        load_demonstrations(tmp_path / "none.safetensors")
+    with pytest.raises(OSError, match=f"{tmp_path}"):
+        load_demonstrations(tmp_path)
+    (tmp_path / "empty.safetensors").write_bytes(b"")
+    with pytest.raises(ValueError, match="'.*empty.safetensors' is truncated"):
+        load_demonstrations(tmp_path / "empty.safetensors")
+
+
+def test_what_cannot_be_saved(tmp_path):
+    with pytest.raises(TypeError, match="data.safetensors' is not JSON-able"):
+        save_demonstrations(tmp_path / "data.safetensors", rows(), {"std": np.float32(1)})
+    with pytest.raises(ValueError, match="'observation.state' has a dot"):
+        data = rows().rename_key_("observation", "observation.state")
+        save_demonstrations(tmp_path / "data.safetensors", data, {})
+    assert not list(tmp_path.iterdir())

@@ -70,7 +70,7 @@ def replace_with_amateur(
         with ``("info", "is_amateur")`` set.
 
     Raises:
-        ValueError: if there are too few trajectories.
+        ValueError: if there are too few trajectories, or a number of a trajectory stands in two runs of rows.
 
     Examples:
         >>> def rows(n):
@@ -80,6 +80,14 @@ def replace_with_amateur(
         >>> replace_with_amateur(rows(4), rows(1))["info", "is_amateur"].sum()
         tensor(1)
     """
+    for name, side in (("experts", experts), ("amateur", amateur)):
+        runs = side["info", "episode"].unique_consecutive()
+        numbers, counts = runs.unique(return_counts=True)
+        if (counts > 1).any():
+            raise ValueError(
+                f"trajectory {numbers[counts > 1][0].item()} of the {name} stands in two runs of rows, and its rows "
+                "would be taken twice: give each trajectory a number of its own under ('info', 'episode')"
+            )
     generator = torch.Generator().manual_seed(seed)
     spare = amateur["info", "episode"].unique().tolist()
     replaced: dict[int, int] = {}

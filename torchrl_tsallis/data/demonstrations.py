@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import warnings
 from collections.abc import Callable
 from typing import Any
 
@@ -15,7 +14,9 @@ from safetensors.torch import save_file
 from tensordict import TensorDict, TensorDictBase
 
 from torchrl_tsallis._io import atomic_path
+from torchrl_tsallis.data.episodes import find_episodes, has_episodes
 from torchrl_tsallis.data.policy import NumpyPolicy
+from torchrl_tsallis.data.schema import check_layout, check_pairs
 
 #: Side entries that training never reads.
 LABELS = ("episode", "expert", "ep_return", "reward", "is_noise", "is_amateur")
@@ -90,10 +91,19 @@ def save_demonstrations(path: str | os.PathLike[str], demonstrations: TensorDict
 
     Raises:
         OSError: if the file cannot be written.
+        TypeError: if the metadata is nothing that JSON can hold.
+        ValueError: if the demonstrations are not ``[N]``, or a key has a dot, by which the file would nest it.
     """
+    check_layout(demonstrations)
+    try:
+        recording = json.dumps(metadata)
+    except (TypeError, ValueError) as error:
+        raise TypeError(
+            f"the metadata of {str(path)!r} is not JSON-able ({error}): convert it to plain numbers"
+        ) from error
     flat = {key: value.contiguous() for key, value in demonstrations.flatten_keys(".").items()}
     with atomic_path(path) as temporary:
-        save_file(flat, temporary, {"recording": json.dumps(metadata)})
+        save_file(flat, temporary, {"recording": recording})
 
 
 def load_demonstrations(path: str | os.PathLike[str]) -> tuple[TensorDict, dict[str, Any]]:
@@ -106,7 +116,9 @@ def load_demonstrations(path: str | os.PathLike[str]) -> tuple[TensorDict, dict[
         The demonstrations, ``[N]``, and the metadata.
 
     Raises:
-        ValueError: if the file is truncated.
+        FileNotFoundError: if it is not there.
+        OSError: if it cannot be read.
+        ValueError: if it is truncated, or holds something other than rows; the message names the file.
 
     Examples:
         >>> import tempfile
@@ -116,59 +128,58 @@ def load_demonstrations(path: str | os.PathLike[str]) -> tuple[TensorDict, dict[
         >>> data.shape, metadata
         (torch.Size([4]), {'std': 0.2})
     """
+    name = repr(str(path))
     try:
         with safe_open(path, "pt") as handle:
-            flat = {name: handle.get_tensor(name) for name in handle.keys()}  # noqa: SIM118
-            metadata = json.loads((handle.metadata() or {}).get("recording", "{}"))
+            flat = {key: handle.get_tensor(key) for key in handle.keys()}  # noqa: SIM118
+            recording = (handle.metadata() or {}).get("recording", "{}")
+    except FileNotFoundError as error:
+        raise FileNotFoundError(error.errno, f"{name} is not there: record it, or give its path") from error
     except SafetensorError as error:
-        raise ValueError(
-            f"{str(path)!r} is truncated or no safetensors file ({error}): delete it and record again"
-        ) from error
-    size = len(next(iter(flat.values())))
-    return TensorDict(flat, [size]).unflatten_keys("."), metadata
+        raise ValueError(f"{name} is truncated or no safetensors file ({error}): delete it and record again") from error
+    except OSError as error:
+        raise OSError(error.errno, f"cannot read {name} ({error}): check its permissions") from error
+    try:
+        metadata = json.loads(recording)
+    except ValueError as error:
+        raise ValueError(f"the metadata of {name} is no JSON ({error}): save the demonstrations again") from error
+    if not isinstance(metadata, dict):
+        raise ValueError(f"the metadata of {name} is {type(metadata).__name__}, needed is an object: save it again")
+    if not flat:
+        raise ValueError(f"{name} holds no tensor: record again")
+    scalars = sorted(key for key, value in flat.items() if not value.ndim)
+    if scalars:
+        raise ValueError(f"{scalars[0]!r} of {name} is a scalar, needed is one entry a row: save it as metadata")
+    lengths = {key: len(value) for key, value in sorted(flat.items())}
+    if len(set(lengths.values())) > 1:
+        raise ValueError(f"the entries of {name} have unequal lengths, {lengths}: they are no rows; record again")
+    size = next(iter(lengths.values()))
+    try:
+        return TensorDict(flat, [size]).unflatten_keys("."), metadata
+    except (KeyError, RuntimeError, ValueError) as error:
+        raise ValueError(f"the keys {sorted(flat)} of {name} nest into each other: rename one") from error
 
 
 def validate_demonstrations(demonstrations: TensorDictBase, *, action_limit: float | None = None) -> None:
     """Checks demonstrations before anything is trained on them.
 
     Args:
-        demonstrations: flat ``[N]`` with ``observation`` ``[N, O]`` and ``action`` ``[N, A]``.
+        demonstrations: flat ``[N]`` with ``observation`` and ``action``, see :mod:`torchrl_tsallis.data.schema`:
+            vectors ``[N, D]``, integers ``[N]``, images, or nested tensordicts of these.
         action_limit: largest magnitude of an action in its space. Default: not checked.
 
     Raises:
         KeyError: if a key is missing.
-        TypeError: if the dtypes are mixed.
-        ValueError: for shapes, non-finite rows, or too few samples; the message names key and rows.
+        TypeError: if the floating-point dtypes are mixed, or an entry is no tensor of real numbers.
+        ValueError: for shapes, non-finite rows, too few samples, or ends of episodes that contradict each other; the
+            message names key and rows.
 
     Warns:
-        UserWarning: for dimensions that never change.
+        UserWarning: for dimensions of vectors that never change. A logged notice says where data is float64.
 
     Examples:
         >>> validate_demonstrations(TensorDict({"observation": torch.rand(3, 2), "action": torch.rand(3, 1)}, [3]))
     """
-    size = len(demonstrations)
-    if size < 2:
-        raise ValueError(f"{size} samples cannot be imitated: record at least two")
-    dtypes = {}
-    for key in ("observation", "action"):
-        value = demonstrations.get(key, None)
-        if value is None:
-            raise KeyError(f"the demonstrations have no {key!r}, only {sorted(map(str, demonstrations.keys()))}")
-        if value.ndim != 2:
-            raise ValueError(f"{key!r} has shape {list(value.shape)}, needed is [{size}, dimension]: flatten it")
-        dtypes[key] = value.dtype
-        bad = (~value.isfinite().all(1)).nonzero()[:, 0].tolist()
-        if bad:
-            raise ValueError(f"{key!r} is NaN or infinite in {len(bad)} of {size} rows, first {bad[:5]}: remove them")
-        constant = (value == value[0]).all(0).nonzero()[:, 0].tolist()
-        if constant:
-            warnings.warn(f"{key!r} never changes in dimensions {constant}", stacklevel=2)
-    if len(set(dtypes.values())) > 1:
-        raise TypeError(f"mixed dtypes {dtypes}: convert the data by demonstrations.float()")
-    if action_limit is not None:
-        outside = (demonstrations["action"].abs() > action_limit).any(1).nonzero()[:, 0].tolist()
-        if outside:
-            raise ValueError(
-                f"'action' is outside of [-{action_limit}, {action_limit}] in {len(outside)} of {size} rows, first "
-                f"{outside[:5]}: clip the executed action, or record it in the space's units"
-            )
+    check_pairs(demonstrations, action_limit=action_limit)
+    if has_episodes(demonstrations):
+        find_episodes(demonstrations, open_end=True)

@@ -8,23 +8,10 @@ from collections.abc import Sequence
 import torch
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
-from torchrl.data import LazyMemmapStorage, SamplerWithoutReplacement, TensorDictReplayBuffer
+from torchrl.data import SamplerWithoutReplacement, TensorDictReplayBuffer
 
-
-def check_rows(demonstrations: TensorDictBase, batch_size: int, keys: Sequence[NestedKey]) -> None:
-    """Raises for what cannot be trained on; see :func:`make_replay_buffer`."""
-    size = len(demonstrations)
-    if size < batch_size:
-        raise ValueError(f"{size} samples are fewer than a batch of {batch_size}: record more, or lower batch_size")
-    for key in keys:
-        value = demonstrations.get(key, None)
-        if value is None:
-            raise KeyError(f"the demonstrations have no {key!r}, only {sorted(map(str, demonstrations.keys(True)))}")
-        bad = (~value.isfinite().flatten(1).all(1)).nonzero()[:, 0].tolist()
-        if bad:
-            raise ValueError(
-                f"{key!r} is NaN or infinite in {len(bad)} of {size} rows, first {bad[:5]}: remove those rows"
-            )
+from torchrl_tsallis.data.schema import check_rows
+from torchrl_tsallis.data.storage import check_batch_size, make_buffer, make_storage
 
 
 def make_replay_buffer(
@@ -34,24 +21,31 @@ def make_replay_buffer(
     seed: int = 0,
     keys: Sequence[NestedKey] = ("observation", "action"),
     scratch_dir: str | os.PathLike[str] | None = None,
+    dtype: torch.dtype | None = None,
 ) -> TensorDictReplayBuffer:
     """Puts demonstrations into a memory-mapped buffer that is sampled epoch by epoch.
 
-    Only ``keys`` are stored: ground-truth labels under ``info`` cannot reach training.
+    Only ``keys`` are stored: ground-truth labels under ``info`` cannot reach training. Demonstrations that are
+    memory-mapped already are read where they are, not copied.
 
     Args:
-        demonstrations: flat ``[N]``.
+        demonstrations: flat ``[N]``, see :mod:`torchrl_tsallis.data.schema`; episodes are not needed.
         batch_size: samples a batch (256, section V-B); an epoch's last, shorter batch is dropped.
         seed: of the order of the samples.
         keys: the entries to store.
-        scratch_dir: folder of the memory map. Default: a temporary one.
+        scratch_dir: folder of the memory map; it may exist, and a second start finds its rows there. Default: shared
+            memory.
+        dtype: of the floating-point numbers in batches, such as torch.float32 for NumPy's float64. Default: as stored;
+            the offline trainer gives a float32 loss float32, with a logged notice.
 
     Returns:
-        The buffer.
+        The buffer. It cannot be written to.
 
     Raises:
         ValueError: if the data is smaller than a batch or not finite; the message names key and rows.
         KeyError: if a key is missing.
+        TypeError: if an entry is no tensor of real numbers.
+        OSError: if ``scratch_dir`` cannot be written.
 
     Examples:
         >>> from tensordict import TensorDict
@@ -59,12 +53,9 @@ def make_replay_buffer(
         >>> make_replay_buffer(data, batch_size=4).sample()["action"].shape
         torch.Size([4, 2])
     """
-    check_rows(demonstrations, batch_size, keys)
-    buffer = TensorDictReplayBuffer(
-        storage=LazyMemmapStorage(len(demonstrations), scratch_dir=scratch_dir),
-        sampler=SamplerWithoutReplacement(drop_last=True),
-        batch_size=batch_size,
-    )
+    check_batch_size(batch_size=batch_size)
+    check_rows(demonstrations, keys, least=batch_size)
+    storage = make_storage([demonstrations.select(*keys)], scratch_dir, dtype=dtype)
+    buffer = make_buffer(storage, SamplerWithoutReplacement(drop_last=True), batch_size)
     buffer.set_rng(torch.Generator().manual_seed(seed))
-    buffer.extend(demonstrations.select(*keys))
     return buffer

@@ -10,21 +10,12 @@ from typing import Any
 import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.utils import NestedKey
-from torchrl.data import LazyMemmapStorage, TensorDictReplayBuffer
+from torchrl.data import TensorDictReplayBuffer
 from torchrl.data.replay_buffers.samplers import Sampler
 from torchrl.data.replay_buffers.storages import Storage
 
-from torchrl_tsallis.data.replay import check_rows
-
-
-class _RowStorage(LazyMemmapStorage):
-    """Reads ``[S, B]`` rows one by one in a row: general indexing takes several times as long."""
-
-    def get(self, index: Any) -> Any:
-        if not isinstance(index, torch.Tensor) or index.ndim != 2:
-            return super().get(index)
-        flat = index.flatten()
-        return self._storage.apply(lambda x: x.index_select(0, flat).unflatten(0, index.shape), batch_size=index.shape)
+from torchrl_tsallis.data.schema import check_layout, check_rows
+from torchrl_tsallis.data.storage import check_batch_size, make_buffer, make_storage
 
 
 class MemberSampler(Sampler):
@@ -122,6 +113,7 @@ def make_stacked_replay_buffer(
     batch_size: int = 256,
     keys: Sequence[NestedKey] = ("observation", "action"),
     scratch_dir: str | os.PathLike[str] | None = None,
+    dtype: torch.dtype | None = None,
 ) -> TensorDictReplayBuffer:
     """Puts the demonstrations of S members into one memory-mapped buffer; ``sample()`` gives ``[S, batch_size]``.
 
@@ -133,14 +125,19 @@ def make_stacked_replay_buffer(
         seeds: of the order of each member's samples.
         batch_size: samples a batch and member (256, section V-B); an epoch's last, shorter batch is dropped.
         keys: the entries to store.
-        scratch_dir: folder of the memory map. Default: a temporary one.
+        scratch_dir: folder of the memory map; it may exist, and a second start finds its rows there. Default: shared
+            memory.
+        dtype: of the floating-point numbers in batches, such as torch.float32 for NumPy's float64. Default: as stored;
+            the offline trainer gives a float32 loss float32, with a logged notice.
 
     Returns:
-        The buffer.
+        The buffer. It cannot be written to.
 
     Raises:
-        ValueError: if the data is smaller than a batch or not finite, or the numbers of members differ.
+        ValueError: if the data is smaller than a batch or not finite, the numbers of members differ, or their entries.
         KeyError: if a key is missing.
+        TypeError: if an entry is no tensor of real numbers.
+        OSError: if ``scratch_dir`` cannot be written.
 
     Examples:
         >>> data = TensorDict({"observation": torch.zeros(8, 3), "action": torch.zeros(8, 2)}, [8])
@@ -150,14 +147,14 @@ def make_stacked_replay_buffer(
     shared = isinstance(demonstrations, TensorDictBase)
     members: list[TensorDictBase] = [demonstrations] * len(seeds) if shared else list(demonstrations)
     unique = {id(member): member for member in members}
+    check_batch_size(batch_size=batch_size)
+    total = sum(check_layout(member) for member in unique.values())
     rows, start = {}, 0
     for name, member in unique.items():
+        check_rows(member, keys, least=batch_size, before=start, total=total)
         rows[name] = range(start, start + len(member))
         start += len(member)
     sampler = MemberSampler(seeds, [rows[id(member)] for member in members])
-    together = torch.cat([member.select(*keys, strict=False) for member in unique.values()])
-    check_rows(together, batch_size, keys)
-    storage = _RowStorage(len(together), scratch_dir=scratch_dir)
-    buffer = TensorDictReplayBuffer(storage=storage, sampler=sampler, batch_size=batch_size)
-    buffer.extend(together)
-    return buffer
+    together = [member.select(*keys) for member in unique.values()]
+    storage = make_storage(together, scratch_dir, dtype=dtype)
+    return make_buffer(storage, sampler, batch_size)

@@ -20,6 +20,7 @@ from torchrl.objectives.utils import TargetNetUpdater
 from torchrl.record.loggers.common import Logger
 from torchrl.trainers import DefaultOptimizationStepper, Trainer, TrainerHookBase
 
+from torchrl_tsallis.data.storage import single_precision
 from torchrl_tsallis.ratings.tuner import RatingTuner
 from torchrl_tsallis.trainers.stacked import LogMembers, MemberStepper
 
@@ -73,13 +74,15 @@ class SampleHook(TrainerHookBase):
 
     def __init__(self, replay_buffer: ReplayBuffer) -> None:
         self.replay_buffer = replay_buffer
+        self._single = False
 
     def __call__(self, _: TensorDictBase) -> TensorDictBase:
         """Samples a batch."""
-        return self.replay_buffer.sample()
+        return single_precision(self.replay_buffer.sample()) if self._single else self.replay_buffer.sample()
 
     def register(self, trainer: Trainer, name: str = "sampler") -> None:
-        """Registers the sampling before each step, and for checkpoints."""
+        """Registers the sampling before each step, and for checkpoints; a float32 loss gets float32 batches."""
+        self._single = {p.dtype for p in trainer.loss_module.parameters()} == {torch.float32}
         trainer.register_op("process_optim_batch", self)
         trainer.register_module(name, self)
 
