@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from torchrl_tsallis._io import atomic_path
+from torchrl_tsallis.jobs import atomic_path
 
 COLUMNS = ("method", "task", "std", "seed", "episode", "return")
 Key = tuple[str, str, float, int]  # method, task, std, seed: one policy

@@ -14,8 +14,8 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from tensordict import TensorDict, TensorDictBase
 
-from torchrl_tsallis._io import atomic_path
 from torchrl_tsallis.data.policy import NumpyPolicy
+from torchrl_tsallis.jobs import atomic_path
 
 #: Side entries that training never reads.
 LABELS = ("episode", "expert", "ep_return", "reward", "is_noise", "is_amateur")

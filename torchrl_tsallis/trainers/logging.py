@@ -16,7 +16,7 @@ import numpy as np
 from torchrl.record.loggers.common import Logger
 from torchrl.record.loggers.csv import CSVLogger
 
-from torchrl_tsallis._io import atomic_path
+from torchrl_tsallis.jobs import atomic_path
 
 Kind = Literal["csv", "tensorboard", "wandb"]
 
