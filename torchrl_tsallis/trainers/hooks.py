@@ -17,7 +17,6 @@ from torchrl.trainers import Trainer, TrainerHookBase
 
 from torchrl_tsallis._checks import check_number
 
-
 _MANY = 100  # members of a container; one with more is data
 
 
