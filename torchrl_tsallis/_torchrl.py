@@ -11,6 +11,7 @@ from typing import Any
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
+from torchrl._utils import logger as logger  # warnings belong where TorchRL's own go, whose level a user sets there
 from torchrl.data.replay_buffers.samplers import Sampler
 from torchrl.objectives.common import LossModule
 from torchrl.objectives.utils import TargetNetUpdater
@@ -82,6 +83,6 @@ def parts_of(actor: TensorDictModuleBase) -> list[TensorDictModuleBase]:
     return list(actor._module_iter())
 
 
-def source_and_target_params(updater: TargetNetUpdater) -> tuple[dict[str, Any], dict[str, Any]]:
+def source_and_target_params(updater: TargetNetUpdater) -> tuple[TensorDictBase, TensorDictBase]:
     """Parameters that are followed, and those that follow; an updater with a state a tensor needs both."""
     return updater._sources, updater._targets

@@ -9,10 +9,10 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, get_args
 
-from torchrl._utils import logger as torchrl_logger
 from torchrl.checkpoint import Checkpoint, CheckpointError, CheckpointRotation
 from torchrl.trainers import Trainer
 
+from torchrl_tsallis._torchrl import logger as torchrl_logger
 from torchrl_tsallis.jobs import disk_errors
 from torchrl_tsallis.trainers.checkpoint_files import check_checkpoint, checkpoints_in, read_manifest, remove_remains
 from torchrl_tsallis.trainers.logging import LoggerGroup

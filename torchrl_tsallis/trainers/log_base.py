@@ -7,7 +7,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from torchrl._utils import logger as torchrl_logger
+
+from torchrl_tsallis._torchrl import logger as torchrl_logger
 
 
 class LogAdapter:
