@@ -74,6 +74,13 @@ def test_results_are_in_the_order_of_the_jobs_and_workers_have_one_thread(jobs):
     assert run_jobs(jobs.threads, [1], workers=1, **BAR) == ["1"]
 
 
+@pytest.mark.parametrize("workers", [-1, 2.5, True, None, "2"])
+def test_a_number_of_workers_that_is_none_is_refused(workers):
+    for run in (partial(run_jobs, **BAR), lambda *args, **kwargs: list(finished_jobs(*args, **kwargs))):
+        with pytest.raises((ValueError, TypeError), match="^workers must be an integer of at least [01], got "):
+            run(abs, [1], workers=workers)
+
+
 def test_an_error_of_a_job_is_passed_on(jobs):
     with pytest.raises(ValueError, match="no 1"):
         run_jobs(jobs.fail, [1], workers=1, **BAR)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import math
 import zipfile
 from pathlib import Path
@@ -209,6 +210,41 @@ def test_an_optimizer_of_other_parameters_is_named(small):
 def test_the_guard_refuses_a_negative_number():
     with pytest.raises(ValueError, match="max_skips"):
         GuardedStepper(-1)
+
+
+def test_a_folder_that_cannot_be_written_is_named_before_the_training(small, tmp_path):
+    (tmp_path / "file").write_text("")
+    trainer, loss = small.make_trainer(tmp_path / "file" / "checkpoints")
+    before = [p.detach().clone() for p in loss.parameters()]
+    with pytest.raises(OSError, match=r"cannot write '.*file/checkpoints'.*choose another output folder"):
+        trainer.train()
+    assert all(torch.equal(a, b) for a, b in zip(before, loss.parameters(), strict=True))
+
+
+@pytest.mark.parametrize(
+    ("writer", "error"),
+    [
+        ("tensordict.save", RuntimeError("unable to write to file </x>: No space left on device (28)")),
+        ("json.dump", OSError(errno.ENOSPC, "No space left on device")),
+        ("os.replace", OSError(errno.EROFS, "Read-only file system")),
+    ],
+)
+def test_a_disk_that_fails_anywhere_in_a_checkpoint_leaves_the_ones_of_before(
+    small, tmp_path, monkeypatch, writer, error
+):
+    small.make_trainer(tmp_path, steps=8)[0].train()
+    trainer, _ = small.make_trainer(tmp_path)
+    assert resume(trainer) == 8
+
+    def fail(*args, **kwargs):
+        raise error
+
+    monkeypatch.setattr(writer, fail)
+    with pytest.raises(OSError, match=rf"cannot write '{tmp_path}' .*(No space|Read-only).*free space"):
+        trainer.train()
+    monkeypatch.undo()
+    assert [path.name for path in tmp_path.iterdir()] == ["checkpoint-000000000008.torchrl"]
+    assert resume(small.make_trainer(tmp_path)[0]) == 8
 
 
 def test_a_full_disk_stops_the_training_and_keeps_the_checkpoints(small, tmp_path, monkeypatch):

@@ -94,3 +94,19 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
     finally:
         if temporary is not None:
             temporary.unlink(missing_ok=True)
+
+
+def check_writable(folder: str | os.PathLike[str]) -> None:
+    """Makes a folder, and fails at once where nothing can be written to it.
+
+    Args:
+        folder: of files that are written later.
+
+    Raises:
+        OSError: if it cannot be written; the message names it and what to check.
+    """
+    mark = Path(folder) / ".writable"
+    with disk_errors(folder):
+        mark.parent.mkdir(parents=True, exist_ok=True)
+        mark.write_text("x")
+        mark.unlink()

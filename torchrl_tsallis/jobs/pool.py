@@ -17,6 +17,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
+from torchrl_tsallis._checks import check_number
+
 Job = TypeVar("Job")
 Result = TypeVar("Result")
 
@@ -131,6 +133,8 @@ def finished_jobs(
         Exception: of a job, passed on. The other jobs are stopped then, and after Ctrl-C.
     """
     _end_if_unguarded()
+    check_number("workers", workers, low=1, integer=True)
+    check_number("retries", retries, low=0, integer=True)
     waiting = deque((job, 0) for job in jobs)  # with the number of its workers' deaths
     suspects: deque[tuple[Job, int]] = deque()
     context = multiprocessing.get_context("spawn")
@@ -218,6 +222,7 @@ def run_jobs(
     from tqdm import tqdm
 
     _end_if_unguarded()
+    check_number("workers", workers, low=0, integer=True)
     with tqdm(total=total, desc=desc, unit=unit, disable=not progress) as bar:
         if workers == 0:
             global _QUEUE

@@ -14,7 +14,7 @@ import numpy as np
 from torchrl.record.loggers.common import Logger
 from torchrl.record.loggers.csv import CSVLogger
 
-from torchrl_tsallis.jobs import atomic_path, disk_errors
+from torchrl_tsallis.jobs import atomic_path, check_writable, disk_errors
 from torchrl_tsallis.trainers.log_adapters import adapter_of, sorted_columns
 from torchrl_tsallis.trainers.log_base import LogAdapter
 
@@ -197,9 +197,7 @@ def make_logger(
     if "/" in check_name(name, what="the run's name"):
         raise ValueError(f"the run's name {name!r} holds a /: put the folders above it into folder")
     root = Path(folder)
-    with atomic_path(root / name / ".writable"):  # fails early, with a clear message
-        pass
-    (root / name / ".writable").unlink()
+    check_writable(root / name)
     loggers: list[Logger] = [CSVLogger(name, str(root))]
     if kind == "tensorboard":
         from torchrl.record.loggers.tensorboard import TensorboardLogger

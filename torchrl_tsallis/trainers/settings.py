@@ -15,6 +15,8 @@ from torchrl_tsallis._torchrl import registered_modules
 #: Whose settings hold: the checkpoint's, the new trainer's, or neither if they differ.
 Settings = Literal["refuse", "checkpoint", "new"]
 _LONGEST = 1000  # entries of a list that is still a setting, and no data
+#: Public attributes that are no settings: they change as a training goes on, or a batch is drawn.
+_STATES = {"training", "len_storage", "skipped", "in_a_row", "best", "without_best", "initialized", "last_epoch"}
 _LOADED = ("optimizer", "lr_schedule")  # the parts whose settings come along with the checkpoint's state
 
 
@@ -27,7 +29,8 @@ def _plain(value: Any) -> bool:
 
 def _public(owner: Any) -> dict[str, Any]:
     """The plain public attributes of an object."""
-    return {k: v for k, v in vars(owner).items() if not k.startswith("_") and k != "training" and _plain(v)}
+    own = getattr(owner, "__dict__", {})
+    return {k: v for k, v in own.items() if not k.startswith("_") and k not in _STATES and _plain(v)}
 
 
 def _groups(optimizer: torch.optim.Optimizer) -> dict[str, Any]:
@@ -56,7 +59,7 @@ def _parts(trainer: Trainer) -> Iterator[tuple[str, Any]]:
         buffer = getattr(module, "replay_buffer", None)
         if buffer is not None:
             yield "buffer", buffer
-            yield f"{name}.sampler", buffer.sampler
+            yield f"{name}.sampler", getattr(buffer, "sampler", None)
         for attribute in ("optimizer", "schedule"):
             inner = getattr(module, attribute, None)
             if inner is not None and inner is not trainer.optimizer:
@@ -73,14 +76,14 @@ def settings_of(trainer: Trainer) -> dict[str, Any]:
         By name, as JSON would give it back; ``optimizer.lr`` for one.
     """
     found: dict[str, Any] = {"trainer.clip_norm": trainer.clip_norm, "trainer.log_every": trainer.collector.steps}
-    tuned = "q_tuner" in registered_modules(trainer)
+    tuned = any("tuner" in name for name in registered_modules(trainer))
     for name, part in _parts(trainer):
         if part is None:
             continue
         found[f"{name}.class"] = type(part).__name__
         own = _groups(part) if isinstance(part, torch.optim.Optimizer) else _public(part)
         if name == "buffer":
-            own["batch_size"] = part.batch_size
+            own["batch_size"] = getattr(part, "batch_size", None)
         if isinstance(part, nn.Module) and not tuned:  # what is tuned is a state
             own |= {key: value.tolist() for key, value in part.named_buffers(recurse=False)}
         found |= {f"{name}.{key}": value for key, value in own.items()}

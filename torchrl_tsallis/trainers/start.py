@@ -11,6 +11,7 @@ from torchrl.checkpoint import CheckpointRotation
 from torchrl.trainers import Trainer
 
 from torchrl_tsallis._torchrl import advance_bar, stop_reason, withdraw_stop
+from torchrl_tsallis.jobs import check_writable
 from torchrl_tsallis.trainers.checkpoint_files import checkpoints_in, remove, remove_remains
 from torchrl_tsallis.trainers.logging import LoggerGroup
 from torchrl_tsallis.trainers.settings import settings_of
@@ -111,8 +112,11 @@ class RunStart:
     def __call__(self) -> None:
         """Called when the training begins."""
         _ = self.settings
+        rotation = self.trainer.checkpoint_rotation
+        if rotation is not None:
+            check_writable(rotation.directory)  # before hours of training
         if self.trainer.collected_frames == 0 and not self.resumed:
-            self._begin_anew(self.trainer.checkpoint_rotation, self.trainer.logger)
+            self._begin_anew(rotation, self.trainer.logger)
         advance_bar(self.trainer)
 
     def _begin_anew(self, rotation: CheckpointRotation | None, logger: Any) -> None:
