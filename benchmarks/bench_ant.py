@@ -13,8 +13,7 @@ import statistics
 import time
 import warnings
 from collections.abc import Callable
-from concurrent.futures import ProcessPoolExecutor
-from multiprocessing import get_context
+from functools import partial
 
 import gymnasium
 import numpy as np
@@ -25,6 +24,7 @@ from torchrl_tsallis.envs import make_ant
 from torchrl_tsallis.evaluation import MeanPolicy, evaluate_policies
 from torchrl_tsallis.evaluation.episodes import make_environment, run_episodes
 from torchrl_tsallis.evaluation.rollouts import GROUP
+from torchrl_tsallis.jobs import finished_jobs
 from torchrl_tsallis.modules import make_policy
 
 REPEATS, STEPS, SEED = 5, 1000, 10_000
@@ -157,9 +157,8 @@ def main() -> None:
     policy = clone_expert()
     actions = record(policy)
     show("one process", measure(policy, actions))
-    with ProcessPoolExecutor(2, get_context("spawn")) as pool:
-        for future in [pool.submit(measure, policy, actions) for _ in range(2)]:
-            show("one of two processes at once", future.result())
+    for _, result in finished_jobs(partial(measure, policy), [actions, actions], workers=2):
+        show("one of two processes at once", result)
     before = time.perf_counter()
     evaluate_policies({"clone": policy}, episodes=2, workers=2, progress=False)
     print(f"evaluate_policies of 2 episodes on 2 workers: {time.perf_counter() - before:.1f} s, most of it their start")

@@ -72,7 +72,7 @@ def draw(training: dict[int, dict[str, float]], evaluation: dict[int, dict[int, 
     """One picture of all."""
     from matplotlib.figure import Figure
 
-    from torchrl_tsallis._io import atomic_path
+    from torchrl_tsallis.jobs import atomic_path
 
     figure = Figure(figsize=(10.5, 3.2), dpi=150, layout="constrained")
     panels = figure.subplots(1, 3)

@@ -29,10 +29,9 @@ from safetensors.torch import load_file, save_file
 from torchrl._utils import logger as torchrl_logger
 
 import torchrl_tsallis.trainers.configs  # noqa: F401 (registers the groups that the YAML file names)
-from torchrl_tsallis._io import atomic_path
-from torchrl_tsallis._pool import run_jobs, tick
 from torchrl_tsallis.data import make_replay_buffer, validate_demonstrations
 from torchrl_tsallis.evaluation import MeanPolicy, evaluate_policies, median, record_rollout
+from torchrl_tsallis.jobs import atomic_path, run_jobs, tick
 from torchrl_tsallis.trainers import LoggerGroup, make_logger, resume
 
 Unit = tuple[str, int, str]  # task, seed, method: one training

@@ -11,7 +11,6 @@ import numpy as np
 from safetensors.numpy import load_file
 from torch import Tensor
 
-from torchrl_tsallis._io import atomic_path
 from torchrl_tsallis.evaluation import (
     auroc,
     auroc_bars,
@@ -22,6 +21,7 @@ from torchrl_tsallis.evaluation import (
     return_by_method,
     schedule,
 )
+from torchrl_tsallis.jobs import atomic_path
 from torchrl_tsallis.trainers import make_logger
 
 COLUMNS = ("method", "task", "seed", "episode", "return")

@@ -19,11 +19,9 @@ from torch import Tensor
 from torchrl._utils import logger as torchrl_logger
 
 import torchrl_tsallis.trainers.configs  # noqa: F401 (registers the groups that the YAML file names)
-from torchrl_tsallis._io import atomic_path
-from torchrl_tsallis._pool import run_jobs, tick
-from torchrl_tsallis._ray import run_jobs_on_ray
 from torchrl_tsallis.data import make_stacked_replay_buffer
 from torchrl_tsallis.evaluation import MeanPolicy, evaluate_policies
+from torchrl_tsallis.jobs import atomic_path, run_jobs, run_jobs_on_ray, tick
 from torchrl_tsallis.trainers import keep_freed_memory, make_logger, resume
 
 

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from torchrl_tsallis._io import atomic_path
+from torchrl_tsallis.jobs import atomic_path
 
 COLUMNS = ("method", "trio", "task", "std", "scale", "seed", "episode", "return")
 FORMATS = {"std": float, "scale": float, "seed": int, "episode": int, "return": float}

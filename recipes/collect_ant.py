@@ -16,9 +16,9 @@ import torch
 from omegaconf import DictConfig
 from tensordict import TensorDict
 
-from torchrl_tsallis._pool import run_jobs, tick
 from torchrl_tsallis.data import load_demonstrations, load_policy, record_trajectory, save_demonstrations
 from torchrl_tsallis.envs import make_ant
+from torchrl_tsallis.jobs import run_jobs, tick
 
 EXPERTS = ("expert_0", "expert_1", "expert_2")
 TRAJECTORIES = 10

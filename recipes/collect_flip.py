@@ -9,8 +9,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import multiprocessing
-from concurrent.futures import ProcessPoolExecutor
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -20,13 +18,13 @@ import numpy as np
 import torch
 from omegaconf import DictConfig
 from tensordict import TensorDict
-from tqdm import tqdm
 
 from torchrl_tsallis.data import flip_demonstrations, load_demonstrations, save_demonstrations, teleoperation
 from torchrl_tsallis.data.flip_demonstrations import FAULTS, record_flips, replay_forces
 from torchrl_tsallis.envs import _arm, _flip_world, _notebook, count_flips, flips, make_page_flip, page_flip
 from torchrl_tsallis.evaluation import record_rollout
 from torchrl_tsallis.evaluation.flip_plots import force_over_time
+from torchrl_tsallis.jobs import run_jobs, tick
 
 SOURCES = (_arm, _notebook, _flip_world, page_flip, flips, teleoperation, flip_demonstrations)
 
@@ -41,6 +39,7 @@ def record(job: tuple[int, int], steps: int, replay: bool) -> tuple[dict[str, np
         observations, again = replay_forces(make_page_flip, data["action"], seed=seed)
         error = np.abs(observations - data["next", "observation"].numpy())[:, :3].max()
         facts |= {"replayed": again.total, "replay_error": float(error)}
+    tick()
     return {key: value.numpy() for key, value in data.flatten_keys(".").items()}, facts
 
 
@@ -73,11 +72,9 @@ def collect_flips(
     file = Path(output) / f"flip_n{trajectories}_seed{seed}_steps{steps}_{digest}.safetensors"
     if not file.exists():
         jobs = [(i, 100_000 * (seed + 1) + i) for i in range(trajectories)]
-        context = multiprocessing.get_context("spawn")
-        with ProcessPoolExecutor(workers, mp_context=context) as pool:
-            results = pool.map(partial(record, steps=steps, replay=replay), jobs)
-            bar = tqdm(results, total=len(jobs), desc="recording demonstrations", disable=not progress)
-            parts, facts = zip(*bar, strict=True)
+        bar = {"total": len(jobs), "desc": "recording", "unit": "trajectory", "progress": progress}
+        results = run_jobs(partial(record, steps=steps, replay=replay), jobs, workers=workers, **bar)
+        parts, facts = zip(*results, strict=True)
         metadata = {"seed": seed, "steps": steps, "rate_hz": 50, "trajectories": facts}
         columns = {key: torch.from_numpy(np.concatenate([part[key] for part in parts])) for key in parts[0]}
         data = TensorDict(columns, [trajectories * steps]).unflatten_keys(".")

@@ -12,7 +12,7 @@ from hydra.utils import instantiate
 from omegaconf import DictConfig, ListConfig, OmegaConf
 from torchrl.trainers import Trainer
 
-from torchrl_tsallis._io import atomic_path
+from torchrl_tsallis.jobs import atomic_path
 
 
 def as_list(value: Any) -> list[Any]:

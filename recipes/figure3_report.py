@@ -13,8 +13,8 @@ import numpy as np
 from ant_report import as_markdown, by_method
 from ant_units import as_csv, key_of, parse
 
-from torchrl_tsallis._io import atomic_path
 from torchrl_tsallis.evaluation import bootstrap_interval, improvement_interval, iqm, median, returns_grid
+from torchrl_tsallis.jobs import atomic_path
 
 LABELS = {
     "bc": "BC (q = 1)",

@@ -14,9 +14,9 @@ from ant_report import publish, read_scalars
 from safetensors.numpy import load_file
 from torch import Tensor
 
-from torchrl_tsallis._io import atomic_path
 from torchrl_tsallis.evaluation import auroc, bootstrap_interval, error_curves, flip_trajectories, ratings_over_time
 from torchrl_tsallis.evaluation.plots import schedule
+from torchrl_tsallis.jobs import atomic_path
 
 COLUMNS = ("method", "seed", "trial", "flips", "events", "singles", "multiples", "run", "success")
 

@@ -31,11 +31,10 @@ from torchrl._utils import logger as torchrl_logger
 from torchrl.modules import set_recurrent_mode
 
 import torchrl_tsallis.trainers.configs  # noqa: F401 (registers the groups that the YAML file names)
-from torchrl_tsallis._io import atomic_path
-from torchrl_tsallis._pool import run_jobs, tick
 from torchrl_tsallis.data import Scaling, make_sequence_buffer, split_trajectories, validate_demonstrations
 from torchrl_tsallis.envs import make_page_flip
 from torchrl_tsallis.evaluation import RecurrentMeanPolicy, record_rollout, run_flip_trial
+from torchrl_tsallis.jobs import atomic_path, run_jobs, tick
 from torchrl_tsallis.trainers import EvaluationHook, LoggerGroup, make_logger, resume
 
 Unit = tuple[int, str]  # seed, method: one training

@@ -8,7 +8,7 @@ from typing import Any
 
 from ant_units import as_csv
 
-from torchrl_tsallis._io import atomic_path
+from torchrl_tsallis.jobs import atomic_path
 
 
 def save_raw(path: str | Path, rows: Sequence[Mapping[str, Any]]) -> None:

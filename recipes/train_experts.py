@@ -14,9 +14,7 @@ from __future__ import annotations
 import csv
 import json
 from collections.abc import Callable
-from concurrent.futures import ProcessPoolExecutor
 from functools import partial
-from multiprocessing import get_context
 from pathlib import Path
 
 import gymnasium as gym
@@ -32,8 +30,8 @@ from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.objectives import SoftUpdate
 from tqdm import tqdm
 
-from torchrl_tsallis._io import atomic_path
 from torchrl_tsallis.envs import register_ant
+from torchrl_tsallis.jobs import atomic_path, run_jobs, tick
 
 KEYS = ["observation", "action", ("next", "observation"), ("next", "reward"), ("next", "terminated")]
 
@@ -129,8 +127,9 @@ def train(cfg: DictConfig) -> None:
     progress.close()
 
 
-def card_row(name: str, source: str, cfg: DictConfig) -> str:
+def card_row(policy: tuple[str, str], cfg: DictConfig) -> str:
     """Copy a policy to where it is shipped, evaluate it, and describe it in a row of the card's table."""
+    name, source = policy
     register_ant()
     env = gym.make(cfg.env_id, disable_env_checker=True)
     env.reset(seed=0)  # the first episode of a fresh PyBullet environment starts unlike all later ones
@@ -143,13 +142,15 @@ def card_row(name: str, source: str, cfg: DictConfig) -> str:
         returns, lengths = evaluate(env, numpy_policy(tensors), cfg.card.episodes, rng)
         cells.append(f"{returns.mean():.0f} ± {returns.std():.0f} [{returns.min():.0f}, {returns.max():.0f}]")
         cells.append(f"{lengths.mean():.0f}")
+    tick()
     return "| " + " | ".join(cells) + " |"
 
 
 def write_card(cfg: DictConfig) -> None:
     """Write the model card of the policies to ship."""
-    with ProcessPoolExecutor(2, get_context("spawn")) as pool:
-        rows = list(pool.map(partial(card_row, cfg=cfg), cfg.card.policies.keys(), cfg.card.policies.values()))
+    policies = list(cfg.card.policies.items())
+    bar = {"total": len(policies), "desc": "evaluating", "unit": "policy"}
+    rows = run_jobs(partial(card_row, cfg=cfg), policies, workers=2, **bar)
     text = CARD.format(rows="\n".join(rows), cfg=cfg)
     with atomic_path(cfg.card.path) as path:
         path.write_text(text, encoding="utf-8")

@@ -122,7 +122,7 @@ def test_unknown_names_are_refused(override, message, monkeypatch):
 
 
 def test_a_dying_training_process_is_named(tmp_path):
-    from torchrl_tsallis._pool import run_jobs
+    from torchrl_tsallis.jobs import run_jobs
 
     with pytest.raises(RuntimeError, match="a worker process died while training"):
         run_jobs(os._exit, [1], workers=1, total=1, desc="training", unit="epoch", progress=False)

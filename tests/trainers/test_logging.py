@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+import errno
+import io
 import os
 import subprocess
 import sys
 from http.server import BaseHTTPRequestHandler, HTTPServer
+from pathlib import Path
 from threading import Thread
+from typing import ClassVar
 
 import numpy as np
 import pytest
+from torchrl.record.loggers.csv import CSVLogger
 
-from torchrl_tsallis.trainers import LoggerGroup, make_logger
+from torchrl_tsallis.trainers import ADAPTERS, LogAdapter, LoggerGroup, make_logger
 
 EVERYTHING = """
 import sys
@@ -114,3 +119,108 @@ def test_csv_ignores_what_it_cannot_hold(tmp_path):
     logger.shutdown()
     assert not (tmp_path / "run" / "scalars" / "rating.csv").exists()
     assert repr(logger).startswith("LoggerGroup")
+
+
+class Recorder(LogAdapter):
+    """An adapter of a logger that only this test knows."""
+
+    seen: ClassVar[list] = []
+
+    def __getattribute__(self, name):
+        if name in ("scalar", "histogram", "picture", "table", "video"):
+            return lambda *args: Recorder.seen.append((name, args[0]))
+        return super().__getattribute__(name)
+
+
+def test_every_logger_gets_everything_whatever_its_place(tmp_path, monkeypatch):
+    class Own(CSVLogger):
+        pass
+
+    monkeypatch.setitem(ADAPTERS, Own, Recorder)
+    Recorder.seen = []
+    for loggers in ([Own("a", str(tmp_path)), CSVLogger("b", str(tmp_path))], [Own("c", str(tmp_path))]):
+        group = LoggerGroup(loggers)
+        group.log_scalar("loss", 1.0)
+        group.log_histogram("rating", [1.0])
+        group.log_picture("returns", "returns.png")
+        group.log_video("video", "video.gif")
+        group.log_table("results", [{"a": 1}])
+    kinds = {"scalar": "loss", "histogram": "rating", "picture": "returns", "video": "video", "table": "results"}
+    assert Recorder.seen == 2 * list(kinds.items())
+
+
+@pytest.mark.parametrize("first", [True, False])
+def test_tensorboard_shows_pictures_wherever_it_stands(tmp_path, first):
+    pytest.importorskip("tensorboard")
+    from PIL import Image
+    from tensorboard.backend.event_processing.event_file_loader import EventFileLoader
+
+    frames = [Image.fromarray(np.full((8, 8, 3), i, np.uint8)) for i in (0, 255)]
+    frames[0].save(tmp_path / "video.gif", save_all=True, append_images=frames[1:])
+    frames[0].save(tmp_path / "picture.png")
+    loggers = make_logger("tensorboard", tmp_path, "run").loggers
+    group = LoggerGroup(loggers[::-1] if first else loggers)
+    group.log_picture("returns", tmp_path / "picture.png", step=2)
+    group.log_video("eval/video", tmp_path / "video.gif", step=2)
+    group.log_histogram("rating", np.linspace(0, 1, 50), step=2)
+    group.log_table("results", [{"method": "bc", "median": 600}])
+    group.shutdown()
+    (path,) = (tmp_path / "tensorboard" / "run").glob("events.*")
+    tags = [value.tag for event in EventFileLoader(str(path)).Load() for value in event.summary.value]
+    assert tags == ["returns", "eval/video", "rating", "results/text_summary"]
+
+
+@pytest.mark.parametrize("rows", [[], [{}], [{"a": 1}, {"b": 1}]])
+def test_a_table_without_equal_columns_is_refused(tmp_path, rows):
+    with pytest.raises(ValueError, match="rows of equal columns"):
+        make_logger("csv", tmp_path, "run").log_table("results", rows)
+
+
+FULL = OSError(errno.ENOSPC, "No space left on device")
+
+
+def test_a_full_disk_is_named_by_the_csv_file(tmp_path, monkeypatch):
+    logger = make_logger("csv", tmp_path, "run")
+    logger.log_scalar("loss", 1.0, step=1)
+    file = tmp_path / "run" / "scalars" / "loss.csv"
+    (file.parent / "full.csv").symlink_to("/dev/full")
+    with pytest.raises(OSError, match=r"cannot write '.*full.csv' .No space left.*choose another output folder"):
+        logger.log_scalar("full", 2.0, step=2)
+
+    class Half(io.FileIO):
+        """Writes half of a row, as the last bytes of a disk."""
+
+        def write(self, row):
+            return super().write(row[: len(row) // 2])
+
+    monkeypatch.setattr(Path, "open", lambda path, mode, buffering=-1: Half(path, mode))
+    with pytest.raises(OSError, match=r"cannot write '.*loss.csv' .No space left"):
+        logger.log_scalar("loss", 2.0, step=2)
+    monkeypatch.undo()
+    assert file.read_text() == "1,1.0\n"
+    logger.log_scalar("loss", 3.0, step=3)
+    assert file.read_text() == "1,1.0\n3,3.0\n"
+
+
+@pytest.mark.parametrize(
+    ("method", "arguments"),
+    [
+        ("add_scalar", lambda group: group.log_scalar("loss", 1.0, step=1)),
+        ("add_histogram", lambda group: group.log_histogram("rating", np.ones(3), step=1)),
+        ("add_text", lambda group: group.log_table("results", [{"a": 1}])),
+        ("add_hparams", lambda group: group.log_hparams({"q": 0.8})),
+    ],
+)
+def test_a_full_disk_is_named_by_tensorboard_s_folder(tmp_path, monkeypatch, method, arguments):
+    pytest.importorskip("tensorboard")
+    from torch.utils.tensorboard import SummaryWriter
+
+    def full(*args, **kwargs):
+        raise FULL
+
+    group = make_logger("tensorboard", tmp_path, "run")
+    monkeypatch.setattr(SummaryWriter, method, full)
+    with pytest.raises(OSError, match=r"cannot write '.*tensorboard/run' .No space left.*choose another output folder"):
+        arguments(group)
+    monkeypatch.undo()
+    group.shutdown()

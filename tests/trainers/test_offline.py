@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import math
 import zipfile
 from pathlib import Path
@@ -14,7 +15,8 @@ from torchrl.trainers import Trainer
 from torchrl_tsallis import AdaTerm, TsallisBCLoss
 from torchrl_tsallis.data import make_replay_buffer
 from torchrl_tsallis.modules import make_policy
-from torchrl_tsallis.trainers import EvaluationHook, GuardedStepper, make_logger, make_offline_trainer, resume
+from torchrl_tsallis.trainers import GuardedStepper, make_logger, make_offline_trainer, resume
+from torchrl_tsallis.trainers.stepper import guard_grads
 
 
 @pytest.fixture
@@ -72,12 +74,41 @@ def test_what_the_loss_returns_is_logged_as_averages(small, tmp_path):
     [
         ({"steps": 41}, "steps=41.*log_every=4"),
         ({"checkpoint_every": 6, "checkpoint_dir": "unused"}, "checkpoint_every=6.*log_every=4"),
-        ({"steps": 0}, "steps=0"),
+        ({"steps": 0}, "steps must be an integer of at least 1, got 0"),
+        ({"log_every": 0}, "log_every must be an integer of at least 1, got 0"),
+        ({"steps": -4}, "steps must .* got -4"),
+        ({"checkpoint_every": -1}, "checkpoint_every must .* got -1"),
+        ({"keep_checkpoints": 0, "checkpoint_dir": "unused"}, "keep_checkpoints must .* got 0"),
+        ({"max_skips": -1}, "max_skips must be an integer of at least 0, got -1"),
+        ({"clip_norm": -1}, "clip_norm must be a finite number above 0, got -1"),
+        ({"clip_norm": 0.0}, "clip_norm must .* got 0.0"),
+        ({"clip_norm": math.nan}, "clip_norm must .* got nan"),
+        ({"clip_norm": math.inf}, "clip_norm must .* got inf"),
     ],
 )
 def test_numbers_of_steps_that_do_not_fit(small, settings, message):
     with pytest.raises(ValueError, match=message):
         small.make_trainer(None, **settings)
+
+
+@pytest.mark.parametrize("name", ["steps", "log_every", "checkpoint_every", "keep_checkpoints", "max_skips"])
+@pytest.mark.parametrize("value", [2.5, 4.0, True, "4", None, [4], math.nan])
+def test_numbers_of_steps_that_are_no_whole_numbers(small, name, value):
+    with pytest.raises(TypeError, match=f"^{name} must be an integer of at least [01], got "):
+        small.make_trainer(None, **{name: value})
+
+
+@pytest.mark.parametrize("value", [True, "1", [1.0], 1j])
+def test_a_clip_norm_that_is_no_number(small, value):
+    with pytest.raises(TypeError, match="^clip_norm must be a finite number above 0, got "):
+        small.make_trainer(None, clip_norm=value)
+
+
+def test_a_loss_that_is_not_reduced_is_refused():
+    loss = TsallisBCLoss(make_policy(3, 2), gamma_mix=0.0, reduction="none")
+    data = TensorDict({"observation": torch.zeros(4, 3), "action": torch.zeros(4, 2)}, [4])
+    with pytest.raises(ValueError, match="reduction='mean' or 'sum'"):
+        make_offline_trainer(loss, make_replay_buffer(data, batch_size=2), AdaTerm(loss.parameters()), steps=100)
 
 
 def test_a_target_that_nothing_updates_is_refused():
@@ -118,44 +149,102 @@ def test_too_many_non_finite_steps_in_a_row_stop_the_training(small):
     assert all(value.isfinite().all() for value in loss.state_dict().values())
 
 
+class TwoLosses(TsallisBCLoss):
+    """The loss with a second one, the sum of the weights' squares a member."""
+
+    out_keys = [*TsallisBCLoss.out_keys, "loss_decay"]
+
+    def forward(self, tensordict):
+        out = super().forward(tensordict)
+        return out.set("loss_decay", sum(p.square().sum() for p in self.parameters()))
+
+
+@pytest.mark.parametrize("members", [None, 1, 3])
+def test_every_loss_is_summed(members):
+    torch.manual_seed(0)
+    actors = [make_policy(3, 2, hidden=(4,)) for _ in range(members or 1)]
+    loss = TwoLosses(actors if members else actors[0], gamma_mix=0.0)
+    before = [p.detach().clone() for p in loss.parameters()]
+    optimizer = torch.optim.SGD(loss.parameters(), lr=0.5)
+    # log-densities whose gradient is 0 leave the second loss alone, by which w - lr * 2 w = 0
+    data = TensorDict({"observation": torch.zeros(8, 3), "action": torch.zeros(8, 2)}, [8])
+    batch = data.expand(members, 8) if members else data
+    grads = torch.autograd.grad(TsallisBCLoss.forward(loss, batch)["loss_tsallis_bc"], list(loss.parameters()))
+
+    class Buffer:
+        sampler = make_replay_buffer(data, batch_size=8).sampler
+        batch_size = 8
+
+        def sample(self):
+            return batch
+
+        def __len__(self):
+            return 8
+
+    make_offline_trainer(loss, Buffer(), optimizer, steps=1, log_every=1, progress=False).train()
+    for old, new, grad in zip(before, loss.parameters(), grads, strict=True):
+        torch.testing.assert_close(new.detach(), -0.5 * grad + 0.0 * old, rtol=1e-5, atol=1e-6)
+
+
+def test_a_gradient_is_clipped_as_torch_clips_it(small):
+    gradient = torch.tensor([3.0, 4.0])
+    for members in (False, True):
+        weight = torch.nn.Parameter(torch.zeros(2, 2) if members else torch.zeros(2))
+        weight.grad = torch.stack([gradient, 0.1 * gradient]) if members else gradient.clone()
+        norm, good = guard_grads([weight], torch.zeros(2) if members else torch.zeros(()), clip_norm=1.0)
+        expected = torch.nn.Parameter(torch.zeros(2))
+        expected.grad = gradient.clone()
+        torch.nn.utils.clip_grad_norm_([expected], 1.0)
+        torch.testing.assert_close(weight.grad[0] if members else weight.grad, expected.grad)
+        if members:
+            torch.testing.assert_close(weight.grad[1], 0.1 * gradient)  # shorter than the bound
+        torch.testing.assert_close(norm, torch.tensor([5.0, 0.5]) if members else torch.tensor(5.0))
+        assert good.all()
+
+
+def test_an_optimizer_of_other_parameters_is_named(small):
+    with pytest.raises(RuntimeError, match=r"no parameter of the optimizer has a gradient.*loss.parameters\(\)"):
+        guard_grads([torch.nn.Parameter(torch.zeros(2))], torch.zeros(()))
+
+
 def test_the_guard_refuses_a_negative_number():
     with pytest.raises(ValueError, match="max_skips"):
         GuardedStepper(-1)
 
 
-def test_evaluation_is_logged_and_changes_nothing(small, tmp_path):
-    finals = []
-    for evaluate in (False, True):
-        trainer, loss = small.make_trainer(None, logger=make_logger("csv", tmp_path, f"run{evaluate}"))
-        if evaluate:
-            EvaluationHook(lambda: {"return": float(torch.rand(()))}, every=8).register(trainer)
+def test_a_folder_that_cannot_be_written_is_named_before_the_training(small, tmp_path):
+    (tmp_path / "file").write_text("")
+    trainer, loss = small.make_trainer(tmp_path / "file" / "checkpoints")
+    before = [p.detach().clone() for p in loss.parameters()]
+    with pytest.raises(OSError, match=r"cannot write '.*file/checkpoints'.*choose another output folder"):
         trainer.train()
-        finals.append(loss.state_dict())
-    assert list(scalars(tmp_path / "runTrue", "eval/return")) == [8, 16, 24, 32, 40]
-    assert all(torch.equal(a, b) for a, b in zip(*(final.values() for final in finals), strict=True))
+    assert all(torch.equal(a, b) for a, b in zip(before, loss.parameters(), strict=True))
 
 
-def test_early_stop_after_evaluations_without_a_new_best(small):
-    trainer, _ = small.make_trainer(None)
-    results = iter([1.0, 3.0, 2.0, 3.0, 9.0])
-    hook = EvaluationHook(lambda: {"return": next(results)}, every=4, patience=2)
-    hook.register(trainer)
-    trainer.train()
-    assert trainer.collected_frames == 16
-    assert hook.state_dict() == {"best": 3.0, "without_best": 2}
+@pytest.mark.parametrize(
+    ("writer", "error"),
+    [
+        ("tensordict.save", RuntimeError("unable to write to file </x>: No space left on device (28)")),
+        ("json.dump", OSError(errno.ENOSPC, "No space left on device")),
+        ("os.replace", OSError(errno.EROFS, "Read-only file system")),
+    ],
+)
+def test_a_disk_that_fails_anywhere_in_a_checkpoint_leaves_the_ones_of_before(
+    small, tmp_path, monkeypatch, writer, error
+):
+    small.make_trainer(tmp_path, steps=8)[0].train()
+    trainer, _ = small.make_trainer(tmp_path)
+    assert resume(trainer) == 8
 
+    def fail(*args, **kwargs):
+        raise error
 
-def test_an_evaluation_without_the_monitored_result_names_it(small):
-    trainer, _ = small.make_trainer(None)
-    EvaluationHook(lambda: {"return": 1.0}, every=4, monitor="median", patience=1).register(trainer)
-    with pytest.raises(KeyError, match="return.*median"):
+    monkeypatch.setattr(writer, fail)
+    with pytest.raises(OSError, match=rf"cannot write '{tmp_path}' .*(No space|Read-only).*free space"):
         trainer.train()
-
-
-@pytest.mark.parametrize("settings", [{"every": 0}, {"every": 4, "patience": 0}])
-def test_evaluation_hook_refuses_numbers_that_are_not_positive(settings):
-    with pytest.raises(ValueError, match="positive"):
-        EvaluationHook(dict, **settings)
+    monkeypatch.undo()
+    assert [path.name for path in tmp_path.iterdir()] == ["checkpoint-000000000008.torchrl"]
+    assert resume(small.make_trainer(tmp_path)[0]) == 8
 
 
 def test_a_full_disk_stops_the_training_and_keeps_the_checkpoints(small, tmp_path, monkeypatch):
@@ -168,7 +257,8 @@ def test_a_full_disk_stops_the_training_and_keeps_the_checkpoints(small, tmp_pat
         return write(self, *args, **kwargs)
 
     monkeypatch.setattr(zipfile.ZipFile, "write", full)
-    with pytest.raises(OSError, match="No space left"):
+    with pytest.raises(OSError, match=rf"cannot write '{tmp_path}' .No space left.*choose another output folder"):
         trainer.train()
     monkeypatch.undo()
+    assert all(path.suffix == ".torchrl" for path in tmp_path.iterdir())
     assert resume(small.make_trainer(tmp_path)[0]) == 16

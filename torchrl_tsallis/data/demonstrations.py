@@ -13,10 +13,10 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from tensordict import TensorDict, TensorDictBase
 
-from torchrl_tsallis._io import atomic_path
 from torchrl_tsallis.data.episodes import find_episodes, has_episodes
 from torchrl_tsallis.data.policy import NumpyPolicy
 from torchrl_tsallis.data.schema import check_layout, check_pairs
+from torchrl_tsallis.jobs import atomic_path
 
 #: Side entries that training never reads.
 LABELS = ("episode", "expert", "ep_return", "reward", "is_noise", "is_amateur")

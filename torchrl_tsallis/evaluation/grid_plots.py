@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from torchrl_tsallis._io import atomic_path
 from torchrl_tsallis.evaluation.plots import PALETTE, _canvas
 from torchrl_tsallis.evaluation.statistics import _checked, bootstrap_interval, iqm, median
+from torchrl_tsallis.jobs import atomic_path
 
 
 def returns_grid(

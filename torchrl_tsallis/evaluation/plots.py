@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from torchrl_tsallis._io import atomic_path
 from torchrl_tsallis.evaluation.statistics import _checked, bootstrap_interval
+from torchrl_tsallis.jobs import atomic_path
 
 # Okabe and Ito's palette: told apart with every common colour blindness.
 PALETTE = ("#0072B2", "#E69F00", "#009E73", "#D55E00", "#CC79A7", "#56B4E9", "#8C8C8C", "#000000")

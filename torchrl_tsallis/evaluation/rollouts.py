@@ -2,27 +2,21 @@
 
 from __future__ import annotations
 
-import multiprocessing
-import os
 import pickle
-from collections import Counter, deque
 from collections.abc import Callable, Iterator, Mapping
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
-from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
 
-from torchrl_tsallis._pool import prepare_worker, terminate_workers
 from torchrl_tsallis.evaluation.episodes import EnvFn, EpisodeError, Policy, make_environment, run_episodes
 from torchrl_tsallis.evaluation.mean_policy import MeanPolicy
+from torchrl_tsallis.jobs import WorkerDiedError, finished_jobs
 
 Task = tuple[str, int]
 DEFAULT_ENV = "torchrl_tsallis.envs:make_ant"
 #: Most episodes that a worker steps in turn: fewer batch the policy less, more crowd the processor's caches.
 GROUP = 4
-_THREADS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
 _WORKER: dict[str, Any] = {}
 
 
@@ -79,7 +73,7 @@ def evaluate_policies(
     parts = np.array_split(np.arange(episodes), min(count, episodes))
     groups = [[(name, int(episode)) for episode in part] for name in ready for part in parts]
     done: dict[Task, tuple[float, int]] = {}
-    with _bar(len(tasks), progress) as tick, _one_thread():
+    with _bar(len(tasks), progress) as tick:
         if workers == 0:
             try:
                 _start(ready, env_fn, seed)
@@ -94,7 +88,9 @@ def evaluate_policies(
                     pickle.dumps(policy)
                 except (pickle.PicklingError, AttributeError, TypeError) as error:
                     raise ValueError(f"policy {name!r} cannot be pickled ({error}): define it in a module") from error
-            _run_pool(groups, (ready, env_fn, seed), workers, retries, done, tick)
+            for group, results in _in_workers(groups, (ready, env_fn, seed), workers, retries):
+                done.update(results)
+                tick(len(group))
     return [
         {"policy": t[0], "episode": t[1], "seed": seed + t[1], "return": done[t][0], "length": done[t][1]}
         for t in tasks
@@ -104,7 +100,6 @@ def evaluate_policies(
 def _start(policies: dict[str, Policy], env_fn: EnvFn, seed: int) -> None:
     """Keeps in a worker what its episodes share."""
     _WORKER.update(policies=policies, env_fn=env_fn, seed=seed, envs=[])
-    prepare_worker()
 
 
 def _stop() -> None:
@@ -127,64 +122,26 @@ def _work(group: list[Task]) -> dict[Task, tuple[float, int]]:
         raise RuntimeError(f"policy {name!r}, episode {seed - first} (seed {seed}) failed: {error!r}") from error
 
 
-def _run_pool(
-    groups: list[list[Task]],
-    shared: tuple[Any, ...],
-    workers: int,
-    retries: int,
-    done: dict,
-    tick: Callable[[int], Any],
-) -> None:
+def _in_workers(
+    groups: list[list[Task]], shared: tuple[Any, ...], workers: int, retries: int
+) -> Iterator[tuple[list[Task], dict[Task, tuple[float, int]]]]:
     """Runs the groups; the episodes in flight when a worker dies are tried again one at a time, to find the culprit."""
-    queue, suspects, deaths = deque(groups), deque[list[Task]](), Counter[Task]()
-    context = multiprocessing.get_context("spawn")
-    while queue or suspects:
-        pool = ProcessPoolExecutor(workers, mp_context=context, initializer=_start, initargs=shared)
-        flying: dict[Future, list[Task]] = {}
-        try:
-            while queue or suspects or flying:
-                source, room = (suspects, 1) if suspects else (queue, workers)
-                while source and len(flying) < room:
-                    group = source.popleft()
-                    try:
-                        flying[pool.submit(_work, group)] = group
-                    except BrokenProcessPool:
-                        source.appendleft(group)
-                        raise
-                for future in wait(flying, return_when=FIRST_COMPLETED).done:
-                    done.update(future.result())
-                    tick(len(flying.pop(future)))
-        except BrokenProcessPool as error:
-            hit = [task for group in flying.values() for task in group]
-            deaths.update(hit)
-            lost = [task for task in hit if deaths[task] > retries]
-            if lost:
-                names = ", ".join(f"{name!r} episode {episode}" for name, episode in lost)
-                raise RuntimeError(
-                    f"the worker process died {retries + 1} times on {names}: check memory, and run it with "
-                    "workers=0 to see the cause"
-                ) from error
-            suspects.extend([task] for task in hit)
-        except KeyboardInterrupt:
-            terminate_workers()
-            raise
-        finally:
-            pool.shutdown(wait=True, cancel_futures=True)
-
-
-@contextmanager
-def _one_thread() -> Iterator[None]:
-    """Lets processes started inside use one thread each."""
-    saved = {key: os.environ.get(key) for key in _THREADS}
-    os.environ.update(dict.fromkeys(_THREADS, "1"))
     try:
-        yield
-    finally:
-        for key, value in saved.items():
-            if value is None:
-                os.environ.pop(key, None)
-            else:
-                os.environ[key] = value
+        yield from finished_jobs(
+            _work,
+            groups,
+            workers=workers,
+            retries=retries,
+            split=lambda group: [[task] for task in group],
+            initializer=_start,
+            initargs=shared,
+        )
+    except WorkerDiedError as error:
+        names = ", ".join(f"{name!r} episode {episode}" for group in error.jobs for name, episode in group)
+        raise RuntimeError(
+            f"the worker process died {retries + 1} times on {names}: check memory, and run it with "
+            "workers=0 to see the cause"
+        ) from error
 
 
 @contextmanager

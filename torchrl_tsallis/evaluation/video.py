@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
-from torchrl_tsallis._io import atomic_path
 from torchrl_tsallis.evaluation.episodes import EnvFn, Policy, resolve
 from torchrl_tsallis.evaluation.rollouts import DEFAULT_ENV
+from torchrl_tsallis.jobs import atomic_path
 
 
 def record_rollout(

@@ -226,6 +226,8 @@ class OfflineTrainerConfig(ConfigBase):
     keep_checkpoints: int = 2
     max_skips: int = 10
     clip_norm: float | None = None
+    lr_schedule: Any = None
+    overwrite: bool = False
     progress: bool = True
     _target_: str = "torchrl_tsallis.trainers.configs.make_trainer"
 

@@ -2,23 +2,50 @@
 
 from __future__ import annotations
 
-import netrc
 import os
-import socket
+import re
 import uuid
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
-from urllib.parse import urlsplit
 
 import numpy as np
 from torchrl.record.loggers.common import Logger
 from torchrl.record.loggers.csv import CSVLogger
 
-from torchrl_tsallis._io import atomic_path
+from torchrl_tsallis.jobs import atomic_path, check_writable, disk_errors
+from torchrl_tsallis.trainers.log_adapters import adapter_of, sorted_columns
+from torchrl_tsallis.trainers.log_base import LogAdapter
 
 Kind = Literal["csv", "tensorboard", "wandb"]
+#: Seconds that W&B may take to answer before the run is kept offline; ``WANDB_INIT_TIMEOUT`` overrides it.
+TIMEOUT = 30
+
+
+def check_name(name: str, *, what: str = "name") -> str:
+    """Refuses a name that would lead out of the folder in which a file of this name is made.
+
+    Args:
+        name: of a quantity, as ``eval/return``.
+        what: for the message.
+
+    Returns:
+        The name.
+
+    Raises:
+        ValueError: if it is empty, absolute, or has an empty part, ``.``, ``..``, a backslash or a NUL.
+
+    Examples:
+        >>> check_name("eval/return")
+        'eval/return'
+    """
+    parts = name.split("/") if isinstance(name, str) else [""]
+    if any(part in ("", ".", "..") for part in parts) or set(name) & set("\\\0") or re.match("[A-Za-z]:", name):
+        raise ValueError(
+            f"{what} {name!r} leads out of its folder: use letters, digits, and / between the parts of a quantity"
+        )
+    return name
 
 
 class LoggerGroup(Logger):
@@ -28,76 +55,86 @@ class LoggerGroup(Logger):
         loggers: the loggers; the first one decides about name and folder.
 
     Raises:
-        ValueError: if there is no logger.
+        ValueError: if there is no logger. A quantity's name that leads out of its folder is refused where it is logged.
+        OSError: where something is logged, if the disk is full or read-only; the message names the path.
+
+    Examples:
+        >>> import tempfile
+        >>> group = LoggerGroup([CSVLogger("bc", tempfile.mkdtemp())])
+        >>> group.log_scalar("loss", 1.0, step=3)
+        >>> group.last_step()
+        3
     """
 
     def __init__(self, loggers: Sequence[Logger]) -> None:
         if not loggers:
             raise ValueError("a group needs at least one logger")
         self.loggers = list(loggers)
+        self.adapters = [adapter_of(logger) for logger in loggers]
         super().__init__(self.loggers[0].exp_name, self.loggers[0].log_dir)
 
     def _create_experiment(self) -> None:
         """The loggers have their own."""
 
+    def _each(self, log: Callable[[LogAdapter], Any]) -> None:
+        """Does something by every adapter."""
+        for adapter in self.adapters:
+            with disk_errors(adapter.folder):
+                log(adapter)
+
     def log_scalar(self, name: str, value: float, step: int | None = None) -> None:
         """Logs a number."""
-        for logger in self.loggers:
-            logger.log_scalar(name, value, step=step)
+        check_name(name)
+        self._each(lambda adapter: adapter.scalar(name, value, step))
 
     def log_hparams(self, cfg: Mapping[str, Any]) -> None:
         """Logs the configuration, nested or not."""
         flat = _flatten(cfg)
-        for logger in self.loggers:
-            logger.log_hparams(dict(cfg) if type(logger).__name__ == "WandbLogger" else flat)
+        self._each(lambda adapter: adapter.hparams(cfg, flat))
 
     def log_histogram(self, name: str, data: Any, step: int | None = None, **kwargs: Any) -> None:
         """Logs the distribution of numbers, where a logger can (CSV cannot)."""
+        check_name(name)
         values = np.asarray(data, dtype=np.float64).ravel()
-        for logger in self.loggers[1:]:
-            if type(logger).__name__ == "WandbLogger":
-                logger.log_histogram(name, values, step=step, bins=64)
-            else:
-                logger.log_histogram(name, values, step=step, bins="tensorflow")
+        self._each(lambda adapter: adapter.histogram(name, values, step))
 
     def log_video(self, name: str, video: Any, step: int | None = None, **kwargs: Any) -> None:
-        """Logs a video file (path to ``.mp4`` or ``.gif``); without W&B the file itself is the result."""
-        self._log_file(name, Path(video), "Video", step)
+        """Logs a video file (path to ``.mp4`` or ``.gif``), where a logger can; the file itself stays."""
+        check_name(name)
+        self._each(lambda adapter: adapter.video(name, Path(video), step))
 
     def log_picture(self, name: str, path: str | os.PathLike[str], step: int | None = None) -> None:
-        """Logs a picture file (``.png``)."""
-        self._log_file(name, Path(path), "Image", step)
-
-    def _log_file(self, name: str, path: Path, kind: str, step: int | None) -> None:
-        for logger in self.loggers[1:]:
-            if type(logger).__name__ == "WandbLogger":
-                import wandb
-
-                media = getattr(wandb, kind)(str(path), **({"format": path.suffix[1:]} if kind == "Video" else {}))
-                logger.experiment.log({name: media})
-            elif kind == "Image":
-                from PIL import Image
-
-                pixels = np.asarray(Image.open(path).convert("RGB"))
-                logger.experiment.add_image(name, pixels, global_step=step, dataformats="HWC")
+        """Logs a picture file (``.png``), where a logger can."""
+        check_name(name)
+        self._each(lambda adapter: adapter.picture(name, Path(path), step))
 
     def log_table(self, name: str, rows: Sequence[Mapping[str, Any]]) -> None:
         """Logs rows of equal columns, as a table in W&B and as text in TensorBoard."""
-        columns = list(rows[0])
-        for logger in self.loggers[1:]:
-            if type(logger).__name__ == "WandbLogger":
-                import wandb
+        check_name(name)
+        columns, cells = sorted_columns(rows)
+        self._each(lambda adapter: adapter.table(name, columns, cells))
 
-                table = wandb.Table(columns=[*columns], data=[[row[c] for c in columns] for row in rows])
-                logger.experiment.log({name: table})
-            else:
-                lines = [columns, ["---"] * len(columns), *([str(row[c]) for c in columns] for row in rows)]
-                logger.experiment.add_text(name, "\n".join("|" + "|".join(line) + "|" for line in lines))
+    def last_step(self) -> int | None:
+        """The largest step in the loggers' files; None if they have none."""
+        return max((s for adapter in self.adapters if (s := adapter.last_step()) is not None), default=None)
+
+    def cut(self, step: int) -> None:
+        """Removes the rows of later steps, so that a resumed training logs none of them twice.
+
+        CSV and TensorBoard files are written anew without them. W&B takes nothing back: what it has of the later steps
+        by the files of the first logger is not sent again. The training is resumed bit for bit, so it is the same.
+
+        Args:
+            step: the last one that stays.
+        """
+        known: dict[str, int] = {}
+        for adapter in self.adapters:
+            with disk_errors(adapter.folder):
+                known |= adapter.cut(step, known)
 
     def shutdown(self, timeout: float | None = None) -> None:
         """Closes all of them."""
-        for logger in self.loggers:
-            logger.shutdown()
+        self._each(lambda adapter: adapter.close())
         self._service_shutdown = True
 
     def __repr__(self) -> str:
@@ -127,13 +164,14 @@ def make_logger(
 ) -> LoggerGroup:
     """Makes the loggers of a run: a CSV file per quantity under ``folder/name/scalars``, and what ``kind`` adds.
 
-    W&B goes online only where an account is set up (``wandb login`` or ``WANDB_API_KEY``) and the server answers;
-    otherwise it writes a folder that ``wandb sync`` accepts later. A run that is resumed continues its W&B run.
+    W&B goes online only where an account is set up (``wandb login`` or ``WANDB_API_KEY``) and the server answers within
+    30 s; otherwise it writes a folder that ``wandb sync`` accepts later. ``WANDB_MODE`` decides before both. A run that
+    is resumed continues its W&B run.
 
     Args:
         kind: ``"csv"``, ``"tensorboard"`` or ``"wandb"``.
         folder: where everything is written.
-        name: of the run.
+        name: of the run, one folder below it.
         project: of W&B.
         group: of W&B.
         tags: of W&B.
@@ -142,7 +180,7 @@ def make_logger(
         The loggers.
 
     Raises:
-        ValueError: if there is no such logger.
+        ValueError: if there is no such logger, or the name is no folder's.
         OSError: if the folder cannot be written.
 
     Examples:
@@ -156,10 +194,10 @@ def make_logger(
     """
     if kind not in ("csv", "tensorboard", "wandb"):
         raise ValueError(f"no logger {kind!r}: choose csv, tensorboard or wandb")
+    if "/" in check_name(name, what="the run's name"):
+        raise ValueError(f"the run's name {name!r} holds a /: put the folders above it into folder")
     root = Path(folder)
-    with atomic_path(root / name / ".writable"):  # fails early, with a clear message
-        pass
-    (root / name / ".writable").unlink()
+    check_writable(root / name)
     loggers: list[Logger] = [CSVLogger(name, str(root))]
     if kind == "tensorboard":
         from torchrl.record.loggers.tensorboard import TensorboardLogger
@@ -172,21 +210,21 @@ def make_logger(
 
 def _wandb(root: Path, name: str, settings: dict[str, Any]) -> Logger:
     """A W&B run, online where that is set up and works."""
+    import wandb
     from torchrl.record.loggers.wandb import WandbLogger
 
     file = root / name / "wandb_id.txt"
     settings |= {"save_dir": str(root / name), "log_env_packages": False, "reinit": "create_new"}
-    if "WANDB_MODE" not in os.environ:
-        settings["mode"] = "offline" if (reason := _why_offline()) else "online"
-        if reason and reason != "no account":
-            warnings.warn(f"W&B is not reachable ({reason}): logging off-line; use `wandb sync` later", stacklevel=3)
-        if reason:
-            os.environ.setdefault("WANDB_SILENT", "true")  # it would print a page a run; online it shows the address
+    if "WANDB_INIT_TIMEOUT" not in os.environ:
+        settings["settings"] = wandb.Settings(init_timeout=TIMEOUT)
     try:
+        if "WANDB_MODE" not in os.environ and not wandb.login(prompt=False):
+            settings["mode"] = "offline"
+            os.environ.setdefault("WANDB_SILENT", "true")  # it would print a page a run; online it shows the address
         return WandbLogger(name, id=_wandb_id(file), **settings)
-    except Exception as error:  # wandb raises many kinds for a server that answers, but not as it should
+    except Exception as error:  # wandb raises many kinds for a server that does not answer, or not as it should
         warnings.warn(f"W&B refused the run ({error}): logging off-line; use `wandb sync` later", stacklevel=3)
-        file.unlink()  # the refused run goes on holding its id in this process
+        file.unlink(missing_ok=True)  # the refused run goes on holding its id in this process
         return WandbLogger(name, id=_wandb_id(file), **(settings | {"mode": "offline"}))
 
 
@@ -196,26 +234,3 @@ def _wandb_id(file: Path) -> str:
         with atomic_path(file) as temporary:
             temporary.write_text(uuid.uuid4().hex[:8])
     return file.read_text()
-
-
-def _why_offline() -> str | None:
-    """Why W&B cannot be used online: no account, or a server that does not answer; None if it can."""
-    url = urlsplit(os.environ.get("WANDB_BASE_URL", "https://api.wandb.ai"))
-    host, port = url.hostname or "", url.port or (80 if url.scheme == "http" else 443)
-    if not _has_account(host):
-        return "no account"
-    try:
-        socket.create_connection((host, port), timeout=10).close()
-    except OSError as error:
-        return f"{host}:{port}: {error}"
-    return None
-
-
-def _has_account(host: str) -> bool:
-    """Whether an API key is in the environment or in the netrc file that ``wandb login`` writes."""
-    if os.environ.get("WANDB_API_KEY"):
-        return True
-    try:
-        return netrc.netrc().authenticators(host) is not None
-    except (OSError, netrc.NetrcParseError):
-        return False

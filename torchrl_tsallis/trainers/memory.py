@@ -5,6 +5,8 @@ from __future__ import annotations
 import ctypes
 import sys
 
+from torchrl_tsallis._checks import check_number
+
 _TRIM_THRESHOLD, _TOP_PAD, _MMAP_THRESHOLD = -1, -2, -3  # of malloc.h
 
 
@@ -24,6 +26,7 @@ def keep_freed_memory(megabytes: int = 256) -> bool:
         >>> keep_freed_memory() in (True, False)
         True
     """
+    check_number("megabytes", megabytes, low=0, high=2**11 - 1, integer=True)
     if not sys.platform.startswith("linux"):
         return False
     try:

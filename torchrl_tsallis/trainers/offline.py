@@ -6,63 +6,28 @@ TorchRL's trainer counts the frames that a collector delivers. Offline, one fram
 
 from __future__ import annotations
 
-import math
 import os
-from collections.abc import Callable, Iterator
 from typing import Any
 
 import torch
-from tensordict import TensorDict, TensorDictBase
-from torchrl.checkpoint import Checkpoint, CheckpointRotation, GlobalRNGState
+from tensordict import TensorDictBase
+from torchrl.checkpoint import Checkpoint, GlobalRNGState
 from torchrl.data import ReplayBuffer
 from torchrl.objectives.common import LossModule
 from torchrl.objectives.utils import TargetNetUpdater
 from torchrl.record.loggers.common import Logger
-from torchrl.trainers import DefaultOptimizationStepper, Trainer, TrainerHookBase
+from torchrl.trainers import Trainer, TrainerHookBase
 
+from torchrl_tsallis._checks import check_number
+from torchrl_tsallis._torchrl import own_log_times, sampler_rng
 from torchrl_tsallis.data.storage import single_precision
 from torchrl_tsallis.ratings.tuner import RatingTuner
-from torchrl_tsallis.trainers.stacked import LogMembers, MemberStepper
-
-
-class OfflineClock:
-    """Stands where a trainer expects its collector; delivers ``steps`` empty frames at a time.
-
-    Args:
-        steps: gradient steps between two points of logging.
-
-    Examples:
-        >>> next(iter(OfflineClock(117))).numel()
-        117
-    """
-
-    init_random_frames = 0
-
-    def __init__(self, steps: int) -> None:
-        self.steps = steps
-
-    def __iter__(self) -> Iterator[TensorDictBase]:
-        """Delivers frames without end; the trainer stops by itself."""
-        while True:
-            yield TensorDict({}, [self.steps])
-
-    def set_seed(self, seed: int, static_seed: bool = False) -> int:
-        """Seeds torch, as a collector's environments would be."""
-        torch.manual_seed(seed)
-        return seed
-
-    def update_policy_weights_(self, *args: Any, **kwargs: Any) -> None:
-        """There is no policy to update."""
-
-    def shutdown(self, *args: Any, **kwargs: Any) -> None:
-        """There is nothing to shut down."""
-
-    def state_dict(self) -> dict[str, Any]:
-        """The clock has no state."""
-        return {}
-
-    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """The clock has no state."""
+from torchrl_tsallis.trainers.checkpoints import SafeRotation
+from torchrl_tsallis.trainers.hooks import LogMembers
+from torchrl_tsallis.trainers.logging import LoggerGroup
+from torchrl_tsallis.trainers.schedule import MakeSchedule, ScheduleHook
+from torchrl_tsallis.trainers.start import OfflineClock, RunStart
+from torchrl_tsallis.trainers.stepper import GuardedStepper
 
 
 class SampleHook(TrainerHookBase):
@@ -88,7 +53,7 @@ class SampleHook(TrainerHookBase):
 
     def state_dict(self) -> dict[str, Any]:
         """State of the sampler and of its generator; the data itself is not saved."""
-        rng = self.replay_buffer.sampler._rng
+        rng = sampler_rng(self.replay_buffer.sampler)
         state = {"sampler": dict(self.replay_buffer.sampler.state_dict()), "samples": len(self.replay_buffer)}
         return state if rng is None else {**state, "rng": rng.get_state()}
 
@@ -103,61 +68,9 @@ class SampleHook(TrainerHookBase):
             )
         sampler.load_state_dict(state_dict["sampler"])
         if "rng" in state_dict:
-            rng = sampler._rng or torch.Generator()
+            rng = sampler_rng(sampler) or torch.Generator()
             rng.set_state(state_dict["rng"].clone())
             self.replay_buffer.set_rng(rng)
-
-
-class GuardedStepper(DefaultOptimizationStepper):
-    """TorchRL's optimization step that leaves a non-finite step out, and gives up after too many in a row.
-
-    Args:
-        max_skips: steps in a row that may be skipped.
-
-    Raises:
-        FloatingPointError: in :meth:`step`, after more than ``max_skips`` skipped steps in a row. The policy is as it
-            was before them.
-    """
-
-    def __init__(self, max_skips: int = 10) -> None:
-        super().__init__()
-        if max_skips < 0:
-            raise ValueError(f"max_skips must not be negative, got {max_skips}")
-        self.max_skips = max_skips
-        self.skipped = 0
-        self.in_a_row = 0
-
-    def step(self, trainer: Trainer, sub_batch: TensorDictBase) -> TensorDictBase:
-        """One step of the optimizer; the returned losses are detached, or their graphs would pile up."""
-        losses = trainer.compute_loss(sub_batch)
-        loss = sum(value for key, value in losses.items() if key.startswith("loss"))
-        loss.backward()
-        norm = self._compute_and_clip_grad_norm(trainer.optimizer, trainer.clip_grad_norm, trainer.clip_norm)
-        if math.isfinite(norm) and math.isfinite(loss.item()):
-            trainer.optimizer.step()
-            self.in_a_row = 0
-        else:
-            self.skipped += 1
-            self.in_a_row += 1
-        trainer.optimizer.zero_grad()
-        if self.in_a_row > self.max_skips:
-            raise FloatingPointError(
-                f"{self.in_a_row} steps in a row up to step {trainer._optim_count} had a loss or gradient that is not "
-                f"finite (loss {loss.item()}, gradient norm {norm}): check the data by validate_demonstrations, or "
-                "lower the learning rate; the policy is as it was before them"
-            )
-        out = losses.detach()
-        out["grad_norm"] = torch.tensor(norm)
-        out["skipped_steps"] = torch.tensor(float(self.skipped))
-        return out
-
-    def state_dict(self) -> dict[str, Any]:
-        """Counts of skipped steps."""
-        return {"skipped": self.skipped, "in_a_row": self.in_a_row}
-
-    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Restores the counts."""
-        self.skipped, self.in_a_row = int(state_dict["skipped"]), int(state_dict["in_a_row"])
 
 
 def make_offline_trainer(
@@ -175,6 +88,8 @@ def make_offline_trainer(
     keep_checkpoints: int = 2,
     max_skips: int = 10,
     clip_norm: float | None = None,
+    lr_schedule: MakeSchedule | None = None,
+    overwrite: bool = False,
     progress: bool = True,
 ) -> Trainer:
     """Assembles TorchRL's trainer for a fixed data set.
@@ -194,16 +109,22 @@ def make_offline_trainer(
         checkpoint_every: steps between two checkpoints (1000), a multiple of ``log_every``.
         keep_checkpoints: how many of the newest ones are kept (2).
         max_skips: non-finite steps in a row that are left out before training stops (10).
-        clip_norm: largest norm of the gradient. Default: None.
+        clip_norm: largest norm of the gradient, positive. Default: None.
+        lr_schedule: makes a learning-rate schedule from the optimizer, as ``partial(CosineAnnealingLR, T_max=23400)``;
+            it takes a step with each of the optimizer, is logged as ``lr`` and kept in checkpoints. Default: None.
+        overwrite: whether a training that begins anew removes the checkpoints and log rows of an earlier one (False).
         progress: whether to show a bar.
 
     Returns:
         The trainer; call ``train()``. :func:`~torchrl_tsallis.trainers.resume` continues from a checkpoint.
 
     Raises:
-        ValueError: if the numbers of steps do not fit, or the loss has a target network and no updater is given.
+        ValueError: if a number is outside of its range (of the wrong kind, ``TypeError``), the numbers of steps do not
+            fit, the loss is not reduced, or it has a target network and no updater is given.
+        FileExistsError: in ``train()``, if folder or logger hold another run that is neither resumed nor overwritten.
 
     Examples:
+        >>> from tensordict import TensorDict
         >>> from torchrl_tsallis import AdaTerm, TsallisBCLoss
         >>> from torchrl_tsallis.data import make_replay_buffer
         >>> from torchrl_tsallis.modules import make_policy
@@ -215,21 +136,32 @@ def make_offline_trainer(
         >>> trainer.collected_frames
         4
     """
-    for name, value, unit in (("steps", steps, log_every), ("checkpoint_every", checkpoint_every, log_every)):
-        if value < 1 or unit < 1 or (value % unit and (name == "steps" or checkpoint_dir is not None)):
+    whole = {"steps": steps, "log_every": log_every, "checkpoint_every": checkpoint_every}
+    for name, value in (whole | {"keep_checkpoints": keep_checkpoints}).items():
+        check_number(name, value, low=1, integer=True)
+    for name, value in whole.items():
+        if value % log_every and (name == "steps" or checkpoint_dir is not None):
             raise ValueError(f"{name}={value} must be a positive multiple of {log_every=}: change one of the two")
+    if clip_norm is not None:
+        clip_norm = check_number("clip_norm", clip_norm, above=0)
+    if getattr(loss, "reduction", None) == "none":
+        raise ValueError("the loss is not reduced to a number that can be minimised: give it reduction='mean' or 'sum'")
     if getattr(loss, "needs_target", False) and updater is None:
         raise ValueError("the loss has a target network that nothing updates: pass updater=CATSoftUpdate(loss)")
     members = getattr(loss, "num_members", None)
-    rotation = None if checkpoint_dir is None else CheckpointRotation(checkpoint_dir, keep_last=keep_checkpoints)
+    rotation = None if checkpoint_dir is None else SafeRotation(checkpoint_dir, keep_last=int(keep_checkpoints))
+    stepper = GuardedStepper(max_skips)
+    clock = OfflineClock(int(log_every))
+    if logger is not None and not isinstance(logger, LoggerGroup):
+        logger = LoggerGroup([logger])  # which knows how to cut its rows when the training is resumed
     trainer = Trainer(
-        collector=OfflineClock(log_every),
+        collector=clock,
         total_frames=steps,
         frame_skip=1,
         optim_steps_per_batch=log_every,
         loss_module=loss,
         optimizer=optimizer,
-        optimization_stepper=GuardedStepper(max_skips) if members is None else MemberStepper(max_skips),
+        optimization_stepper=stepper,
         target_net_updater=updater,
         logger=logger,
         log_interval=0,
@@ -239,7 +171,8 @@ def make_offline_trainer(
         checkpoint_rotation=rotation,
         save_trainer_interval=checkpoint_every - 1,  # the trainer saves once more than that has passed
     )
-    trainer._last_log = {}  # TorchRL 0.14 shares this dictionary between all trainers alive
+    own_log_times(trainer)
+    clock.follow(trainer)
     SampleHook(replay_buffer).register(trainer)
     if updater is not None:
         trainer.register_op("post_optim", updater.step)
@@ -247,16 +180,10 @@ def make_offline_trainer(
         tuner.register(trainer)
     if members is not None:
         LogMembers().register(trainer)
+    if lr_schedule is not None:
+        ScheduleHook(lr_schedule, optimizer).register(trainer)
     trainer.register_module("rng", GlobalRNGState())
-    trainer.register_op("setup", _show_resumed(trainer))
+    start = RunStart(trainer, overwrite)
+    trainer.checkpoint_metadata = start.metadata
+    trainer.register_op("setup", start)
     return trainer
-
-
-def _show_resumed(trainer: Trainer) -> Callable[[], None]:
-    """A hook that starts the progress bar where the checkpoint was."""
-
-    def hook() -> None:
-        if trainer.progress_bar:
-            trainer._pbar.update(trainer.collected_frames)
-
-    return hook

@@ -7,8 +7,7 @@ import warnings
 
 import pytest
 
-from torchrl_tsallis._pool import run_jobs, tick
-from torchrl_tsallis._ray import run_jobs_on_ray
+from torchrl_tsallis.jobs import run_jobs, run_jobs_on_ray, tick
 
 BAR = {"total": 6, "desc": "counting", "unit": "tick", "progress": False}
 

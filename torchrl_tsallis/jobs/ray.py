@@ -1,12 +1,12 @@
-"""Work on a Ray cluster, by the signature of :func:`torchrl_tsallis._pool.run_jobs`."""
+"""Work on a Ray cluster, by the signature of :func:`torchrl_tsallis.jobs.run_jobs`."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
-from torchrl_tsallis import _pool
-from torchrl_tsallis._pool import Job, Result
+from torchrl_tsallis.jobs import pool
+from torchrl_tsallis.jobs.pool import Job, Result
 
 
 def _import_ray() -> Any:
@@ -22,7 +22,7 @@ def _import_ray() -> Any:
 
 def _run(function: Callable[[Job], Result], job: Job, queue: Any) -> Result:
     """Runs a job in a worker of Ray, whose ticks go to the queue."""
-    _pool._QUEUE = queue
+    pool._QUEUE = queue
     return function(job)
 
 
@@ -44,7 +44,7 @@ def run_jobs_on_ray(
     nodes of a cluster need this package, and the files that the jobs name.
 
     Args:
-        function: picklable; calls :func:`torchrl_tsallis._pool.tick` as it proceeds. It is called again on a job whose
+        function: picklable; calls :func:`torchrl_tsallis.jobs.tick` as it proceeds. It is called again on a job whose
             process or node died.
         jobs: its arguments, picklable.
         total: number of ticks of all jobs.
