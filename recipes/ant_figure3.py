@@ -36,6 +36,7 @@ from torchrl_tsallis._io import atomic_path
 from torchrl_tsallis._pool import run_jobs, tick
 from torchrl_tsallis._ray import run_jobs_on_ray
 from torchrl_tsallis.data import make_stacked_replay_buffer, make_task
+from torchrl_tsallis.envs import make_ant
 from torchrl_tsallis.evaluation import MeanPolicy, evaluate_policies
 from torchrl_tsallis.trainers import keep_freed_memory, make_logger, resume
 
@@ -117,6 +118,7 @@ def evaluate(unit: Unit, cfg: DictConfig) -> None:
             own = {name.removeprefix(start): value for name, value in states.items() if name.startswith(start)}
             rows = evaluate_policies(
                 {method: MeanPolicy.from_actor_state(own)},
+                env_fn=make_ant,
                 episodes=cfg.evaluation.episodes - first,
                 seed=cfg.evaluation.seed + first,
                 workers=0,  # none but this process

@@ -5,6 +5,7 @@ import pytest
 import torch
 
 from torchrl_tsallis.data import load_policy
+from torchrl_tsallis.envs import make_ant
 from torchrl_tsallis.evaluation import MeanPolicy, evaluate_policies
 from torchrl_tsallis.evaluation.episodes import run_episode
 from torchrl_tsallis.modules import make_policy
@@ -231,7 +232,7 @@ def test_ant_does_not_depend_on_workers_and_groups(monkeypatch):
     results = []
     for workers, group in [(0, 4), (0, 1), (2, 2)]:
         monkeypatch.setattr("torchrl_tsallis.evaluation.rollouts.GROUP", group)
-        results.append(evaluate_policies(policies, episodes=3, workers=workers, progress=False))
+        results.append(evaluate_policies(policies, env_fn=make_ant, episodes=3, workers=workers, progress=False))
     assert results[0] == results[1] == results[2]
     assert results[0][0]["return"] != results[0][1]["return"]
     for row in (results[0][2], results[0][5]):  # the last of each policy, in a fresh environment

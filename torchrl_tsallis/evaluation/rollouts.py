@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import logging
 import multiprocessing
 import os
 import pickle
+import sys
 from collections import Counter, deque
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
@@ -15,24 +17,35 @@ from typing import Any
 import numpy as np
 
 from torchrl_tsallis._pool import prepare_worker, terminate_workers
-from torchrl_tsallis.evaluation.episodes import EnvFn, EpisodeError, Policy, make_environment, run_episodes
-from torchrl_tsallis.evaluation.mean_policy import MeanPolicy
+from torchrl_tsallis.evaluation.episodes import (
+    MAX_STEPS,
+    EnvFn,
+    Episode,
+    EpisodeError,
+    checked_env_fn,
+    make_environment,
+    run_episodes,
+)
+from torchrl_tsallis.evaluation.interface import name_of
+from torchrl_tsallis.evaluation.ownership import Policy, as_policy, left_as_found, set_evaluation
+from torchrl_tsallis.evaluation.settings import whole_number
 
 Task = tuple[str, int]
-DEFAULT_ENV = "torchrl_tsallis.envs:make_ant"
 #: Most episodes that a worker steps in turn: fewer batch the policy less, more crowd the processor's caches.
 GROUP = 4
 _THREADS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
 _WORKER: dict[str, Any] = {}
+_LOGGER = logging.getLogger(__name__)
 
 
 def evaluate_policies(
-    policies: Mapping[str, Mapping[str, Any] | Policy],
+    policies: Mapping[str, Any],
     *,
+    env_fn: EnvFn,
     episodes: int = 100,
     seed: int = 10_000,
     workers: int = 2,
-    env_fn: EnvFn = DEFAULT_ENV,
+    max_steps: int = MAX_STEPS,
     retries: int = 2,
     progress: bool = True,
 ) -> list[dict[str, Any]]:
@@ -41,70 +54,99 @@ def evaluate_policies(
     A worker uses its environments again, so an episode must depend on the seed of ``reset`` alone once an environment
     was reset before. The Ant's does; its physics is restored bit for bit.
 
+    Networks are run in evaluation mode, whatever mode they are in; a policy with ``reset()`` begins each episode with a
+    fresh copy. Modes, memories and the global random numbers are afterwards as they were, also after an error.
+
     Args:
-        policies: name -> picklable callable, observation -> action (for batches see
-            :func:`~torchrl_tsallis.evaluation.episodes.run_episodes`), or an actor's state for
+        policies: name -> picklable callable, observation -> action (see
+            :func:`~torchrl_tsallis.evaluation.episodes.run_episodes`); an actor of TorchRL, which becomes an
+            :class:`~torchrl_tsallis.evaluation.ActorPolicy`; or an actor's state for
             :meth:`MeanPolicy.from_actor_state`.
+        env_fn: ``"module:function"`` or a picklable callable that makes a Gymnasium environment.
         episodes: episodes a policy (100, section V-B); episode i is seeded ``seed + i`` for every policy.
         seed: first seed (10000).
         workers: processes, each with one thread (2); 0 runs in this process.
-        env_fn: ``"module:function"`` or a picklable callable.
+        max_steps: longest episode (10000). A warning is logged where it is reached.
         retries: how often an episode is done again after its worker died (2).
         progress: show a bar, if tqdm is installed.
 
     Returns:
         Rows ``{"policy", "episode", "seed", "return", "length"}`` by policy and episode; they do not depend on
-        the number of workers, to the last bit.
+        the number of workers, to the last bit. The row of an episode that was ended at ``max_steps``, instead of by its
+        environment, also has ``"truncated": True``.
 
     Raises:
-        ValueError: if nothing is to be run or a policy cannot be pickled.
-        RuntimeError: if an episode fails or keeps killing its worker; the message names it.
+        ValueError: if nothing is to be run, a number is no whole one or too small, or policy or environment cannot be
+            pickled.
+        TypeError: if something is no policy or ``env_fn`` makes no environment.
+        RuntimeError: if an episode fails or keeps killing its worker, or no worker can start; the message names it.
 
     Examples:
-        >>> evaluate_policies({"zero": np.zeros_like}, episodes=0)
+        >>> evaluate_policies({"zero": np.zeros_like}, env_fn="torchrl_tsallis.envs:make_ant", episodes=0)
         Traceback (most recent call last):
         ...
-        ValueError: need at least one policy and one episode, got 1 policies, episodes=0
+        ValueError: episodes must be a whole number of at least 1, got episodes=0
     """
-    if not policies or episodes < 1:
-        raise ValueError(f"need at least one policy and one episode, got {len(policies)} policies, {episodes=}")
-    if workers < 0 or retries < 0:
-        raise ValueError(f"workers and retries must not be negative, got {workers=}, {retries=}")
-    ready: dict[str, Policy] = {
-        name: p if callable(p) else MeanPolicy.from_actor_state(p) for name, p in policies.items()
-    }
+    if not isinstance(policies, Mapping) or not policies:
+        raise ValueError(f"policies must be a mapping, name -> policy, of at least one; got {type(policies).__name__}")
+    episodes, seed = whole_number("episodes", episodes, 1), whole_number("seed", seed, 0)
+    workers, retries = whole_number("workers", workers, 0), whole_number("retries", retries, 0)
+    max_steps, env_fn = whole_number("max_steps", max_steps, 1), checked_env_fn(env_fn)
+    ready: dict[str, Policy] = {name: as_policy(name, policy) for name, policy in policies.items()}
+    if workers:
+        _check_start()
     tasks = [(name, episode) for name in ready for episode in range(episodes)]
     # As many groups a policy as keep all workers busy to the end, if episodes last equally long.
     count = max(workers, 1) * -(-episodes // (GROUP * max(workers, 1)))
     parts = np.array_split(np.arange(episodes), min(count, episodes))
     groups = [[(name, int(episode)) for episode in part] for name in ready for part in parts]
-    done: dict[Task, tuple[float, int]] = {}
-    with _bar(len(tasks), progress) as tick, _one_thread():
+    done: dict[Task, Episode] = {}
+    with _bar(len(tasks), progress) as tick, _one_thread(), left_as_found(ready.values()):
         if workers == 0:
             try:
-                _start(ready, env_fn, seed)
+                _start(ready, env_fn, seed, max_steps)
                 for group in groups:
                     done.update(_work(group))
                     tick(len(group))
             finally:
                 _stop()
         else:
-            for name, policy in ready.items():
+            for what, value in [("env_fn", env_fn), *((f"policy {name!r}", policy) for name, policy in ready.items())]:
                 try:
-                    pickle.dumps(policy)
-                except (pickle.PicklingError, AttributeError, TypeError) as error:
-                    raise ValueError(f"policy {name!r} cannot be pickled ({error}): define it in a module") from error
-            _run_pool(groups, (ready, env_fn, seed), workers, retries, done, tick)
-    return [
-        {"policy": t[0], "episode": t[1], "seed": seed + t[1], "return": done[t][0], "length": done[t][1]}
-        for t in tasks
-    ]
+                    pickle.dumps(value)
+                except Exception as error:
+                    raise ValueError(
+                        f"{what} cannot be pickled ({error}): define it in a module, or use workers=0"
+                    ) from error
+            _run_pool(groups, (ready, env_fn, seed, max_steps), workers, retries, done, tick)
+    for name in ready:
+        cut = sum(done[name, episode].cut for episode in range(episodes))
+        if cut:
+            _LOGGER.warning(
+                "policy %r: %d of %d episodes were ended at max_steps=%d before their environment ended them; their "
+                "rows are marked as truncated", name, cut, episodes, max_steps
+            )  # fmt: skip
+    rows = []
+    for name, episode in tasks:
+        total, length, truncated = done[name, episode]
+        row = {"policy": name, "episode": episode, "seed": seed + episode, "return": total, "length": length}
+        rows.append(row | ({"truncated": True} if truncated else {}))
+    return rows
 
 
-def _start(policies: dict[str, Policy], env_fn: EnvFn, seed: int) -> None:
-    """Keeps in a worker what its episodes share."""
-    _WORKER.update(policies=policies, env_fn=env_fn, seed=seed, envs=[])
+def _check_start() -> None:
+    """Ends a worker process that runs its user's script again, and would start workers of its own."""
+    if getattr(multiprocessing.current_process(), "_inheriting", False):  # as multiprocessing.spawn itself asks
+        sys.exit('a worker process cannot run the main script again: put what it does under if __name__ == "__main__":')
+
+
+def _start(policies: dict[str, Policy], env_fn: EnvFn, seed: int, max_steps: int, started: Any = None) -> None:
+    """Keeps in a worker what its episodes share, and tells that it has started."""
+    _WORKER.update(policies=policies, env_fn=env_fn, seed=seed, max_steps=max_steps, envs=[])
     prepare_worker()
+    if started is not None:
+        set_evaluation(policies.values())  # networks that a function names are the worker's own, not sent to it
+        started.set()
 
 
 def _stop() -> None:
@@ -114,17 +156,18 @@ def _stop() -> None:
     _WORKER.clear()
 
 
-def _work(group: list[Task]) -> dict[Task, tuple[float, int]]:
+def _work(group: list[Task]) -> dict[Task, Episode]:
     """Runs episodes of one policy together; an error names the one that failed."""
     name, first, envs = group[0][0], _WORKER["seed"], _WORKER["envs"]
-    seeds = [first + episode for _, episode in group]
+    seeds, policy = [first + episode for _, episode in group], _WORKER["policies"][name]
     try:
         while len(envs) < len(group):
             envs.append(make_environment(_WORKER["env_fn"], seeds[len(envs)]))
-        return dict(zip(group, run_episodes(_WORKER["policies"][name], envs, seeds), strict=True))
+        return dict(zip(group, run_episodes(policy, envs, seeds, max_steps=_WORKER["max_steps"]), strict=True))
     except EpisodeError as failure:
         seed, error = failure.seed, failure.__cause__
-        raise RuntimeError(f"policy {name!r}, episode {seed - first} (seed {seed}) failed: {error!r}") from error
+        where = f" in {name_of(envs[0])}" if envs else ""
+        raise RuntimeError(f"policy {name!r}, episode {seed - first} (seed {seed}){where} failed: {error!r}") from error
 
 
 def _run_pool(
@@ -138,8 +181,9 @@ def _run_pool(
     """Runs the groups; the episodes in flight when a worker dies are tried again one at a time, to find the culprit."""
     queue, suspects, deaths = deque(groups), deque[list[Task]](), Counter[Task]()
     context = multiprocessing.get_context("spawn")
+    started = context.Event()
     while queue or suspects:
-        pool = ProcessPoolExecutor(workers, mp_context=context, initializer=_start, initargs=shared)
+        pool = ProcessPoolExecutor(workers, mp_context=context, initializer=_start, initargs=(*shared, started))
         flying: dict[Future, list[Task]] = {}
         try:
             while queue or suspects or flying:
@@ -155,6 +199,11 @@ def _run_pool(
                     done.update(future.result())
                     tick(len(flying.pop(future)))
         except BrokenProcessPool as error:
+            if not started.is_set():
+                raise RuntimeError(
+                    'no worker process could start: put what the script does under if __name__ == "__main__":, define '
+                    "policies and env_fn in a module that a worker can import, or use workers=0"
+                ) from error
             hit = [task for group in flying.values() for task in group]
             deaths.update(hit)
             lost = [task for task in hit if deaths[task] > retries]
