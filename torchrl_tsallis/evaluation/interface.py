@@ -78,7 +78,7 @@ def take(env: Any, action: Any, shape: tuple[int, ...] | None) -> tuple[Any, flo
 
 
 def _observed(env: Any, observation: Any, shape: tuple[int, ...] | None, method: str) -> Any:
-    found = getattr(observation, "shape", shape)
+    found: Any = getattr(observation, "shape", shape)
     if found != shape and shape is not None:
         raise ValueError(
             f"{method} of {name_of(env)} gave an observation of shape {tuple(found)}, its observation_space has "
@@ -114,10 +114,11 @@ class ActionRule:
     """
 
     def __init__(self, env: Any) -> None:
-        self.env, space = name_of(env), getattr(env, "action_space", None)
+        self.env = name_of(env)
+        space: Any = getattr(env, "action_space", None)
         self.clipped = hasattr(space, "low") and hasattr(space, "high")
         if self.clipped:
-            low, high = space.low, space.high  # type: ignore[union-attr]
+            low, high = space.low, space.high
         elif hasattr(space, "nvec"):
             low = np.zeros_like(space.nvec) + getattr(space, "start", 0)
             high = low + space.nvec - 1

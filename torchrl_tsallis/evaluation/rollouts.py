@@ -203,7 +203,7 @@ def _run_pool(
                 raise RuntimeError(
                     'no worker process could start: put what the script does under if __name__ == "__main__":, define '
                     "policies and env_fn in a module that a worker can import, or use workers=0"
-                ) from error
+                ) from None
             hit = [task for group in flying.values() for task in group]
             deaths.update(hit)
             lost = [task for task in hit if deaths[task] > retries]
