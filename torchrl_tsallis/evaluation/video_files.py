@@ -55,12 +55,12 @@ def write_mp4(frames: Frames, path: str | os.PathLike[str], fps: float) -> None:
     raw = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", size, "-r", f"{fps:.6g}", "-i", "-"]
     video = ["-c:v", "libx264", "-pix_fmt", "yuv420p", "-crf", "20", "-f", "mp4"]
     with atomic_path(path) as temporary:
-        command = [imageio_ffmpeg.get_ffmpeg_exe(), "-y", "-v", "error", *raw, *video, str(temporary)]
+        command = [imageio_ffmpeg.get_ffmpeg_exe(), "-y", "-v", "error", *raw, *video, f"file:{temporary}"]
         data = b"".join(np.pad(frame, even, "edge").tobytes() for frame in frames)
         done = subprocess.run(command, input=data, capture_output=True, check=False)
         if done.returncode:
             said = done.stderr.decode(errors="replace").strip().splitlines() or [f"exit status {done.returncode}"]
-            raise OSError(errno.EIO, f"ffmpeg failed: {said[-1]}")
+            raise OSError(errno.EIO, f"ffmpeg failed: {said[-1].rpartition('] ')[2]}")
         _check(temporary, len(frames))
 
 
