@@ -16,6 +16,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.modules import set_recurrent_mode
 
 Key = tuple[str, ...]
+_DEFAULT = "let the module start from zeros where it finds none, as TorchRL's LSTMModule does"
 
 
 def _tuple(key: NestedKey) -> Key:
@@ -69,6 +70,7 @@ class ActorPolicy:
         if observation_key is not None:
             self.inputs = [_tuple(observation_key)]
         self.action_key = _action_key(actor, outputs) if action_key is None else _tuple(action_key)
+        self._stateless = f"the actor has no initial value for its state {_names(list(self.states))}"
         self.reset()
 
     def reset(self) -> None:
@@ -90,14 +92,13 @@ class ActorPolicy:
         try:
             with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC), set_recurrent_mode(False):
                 written = self.actor(given)
-        except KeyError as error:
+        except (KeyError, TypeError, AttributeError) as error:  # what modules raise where None stands for a tensor
             if self._begun or not self.states:
                 raise
-            raise ValueError(
-                f"the actor has no initial value for its state {_names(list(self.states))}: let the module start from "
-                "zeros where it finds none, as TorchRL's LSTMModule does"
-            ) from error
+            raise ValueError(f"{self._stateless}, its first step fails ({error}): {_DEFAULT}") from error
         self._state = {key: written.get(source) for key, source in self.states.items()}
+        if any(state is None for state in self._state.values()):
+            raise ValueError(f"{self._stateless}, and writes none: {_DEFAULT}")
         self._begun = True
         action = written.get(self.action_key)[0].detach().cpu()
         return (action.float() if action.dtype == torch.bfloat16 else action).numpy()

@@ -139,7 +139,7 @@ class ActionRule:
         self.dtype = self.low.dtype if self.clipped else np.dtype(getattr(space, "dtype", None) or self.low.dtype)
         self.whole = self.dtype.kind != "f"
 
-    def legal(self, actions: Sequence[np.ndarray] | np.ndarray) -> np.ndarray | None:
+    def legal(self, actions: Sequence[np.ndarray] | np.ndarray) -> Sequence[np.ndarray] | np.ndarray | None:
         """Actions of the space for outputs ``[E, *A]``, or None if :meth:`fault` finds one in any of them."""
         # All outputs are tested at once, for speed, as they are clipped, which is np.clip's result.
         if any(action.shape != self.shape for action in actions) or not np.isfinite(actions).all():
@@ -148,7 +148,9 @@ class ActionRule:
             return None
         if not self.clipped and not np.logical_and(actions >= self.low, actions <= self.high).all():
             return None
-        return np.minimum(np.maximum(actions, self.low), self.high).astype(self.dtype, copy=False)
+        legal = np.minimum(np.maximum(actions, self.low), self.high).astype(self.dtype, copy=False)
+        # A number of a Box is an array without dimensions, one of Discrete a scalar.
+        return [np.array(action) for action in legal] if self.clipped and self.shape == () else legal
 
     def fault(self, action: np.ndarray) -> str | None:
         """What is wrong with one output ``[*A]``; None if nothing is."""

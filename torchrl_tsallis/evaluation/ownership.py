@@ -211,6 +211,7 @@ def _parts(thing: Any) -> list[Any]:
     if inspect.isfunction(thing):
         variables = thing.__globals__
         held = [cell.cell_contents for cell in thing.__closure__ or () if cell != _EMPTY]
+        held += [*(thing.__defaults__ or ()), *(thing.__kwdefaults__ or {}).values()]
         return [*held, *(variables[name] for name in thing.__code__.co_names if name in variables)]
     if isinstance(thing, Mapping):
         return list(islice(thing.values(), _WIDTH))

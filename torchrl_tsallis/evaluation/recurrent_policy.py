@@ -10,6 +10,7 @@ import numpy as np
 from torchrl_tsallis.data.policy import as_observation, as_weights
 
 _LSTM = ("weight_ih", "weight_hh", "bias_ih", "bias_hh")
+_PARTS = ("w_ih", "w_hh", "bias")
 _SCALING = ("observation_mean", "observation_std", "action_unit")
 
 
@@ -52,16 +53,11 @@ class RecurrentMeanPolicy:
         if not (self.std > 0).all() or not 0 < self.action_unit < np.inf:
             raise ValueError(f"observation_std and action_unit must be positive, got {self.std} and {self.action_unit}")
         for i, (w, u, b) in enumerate(layers):
-            w, u, b = (
-                as_weights(f"{part} of LSTM layer {i}", x) for part, x in (("w_ih", w), ("w_hh", u), ("bias", b))
-            )
+            w, u, b = (as_weights(f"{name} of LSTM layer {i}", x) for name, x in zip(_PARTS, (w, u, b), strict=True))
             hidden = u.shape[-1] if u.ndim else 0
-            for part, x, shape in (
-                ("w_ih", w, (4 * hidden, width)),
-                ("w_hh", u, (4 * hidden, hidden)),
-                ("bias", b, None),
-            ):
-                _check_shape(f"{part} of LSTM layer {i}", x, shape or (4 * hidden,))
+            shapes = ((4 * hidden, width), (4 * hidden, hidden), (4 * hidden,))
+            for name, x, shape in zip(_PARTS, (w, u, b), shapes, strict=True):
+                _check_shape(f"{name} of LSTM layer {i}", x, shape)
             self.layers.append((np.concatenate([w, u], 1), b))
             width = hidden
         self.head = as_weights("the head's weight", head[0]), as_weights("the head's bias", head[1])
