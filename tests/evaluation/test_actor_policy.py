@@ -151,3 +151,5 @@ def test_unclear_keys_are_refused_by_name_and_can_be_named(make_env):
         strict = TensorDictModule(cell, in_keys=["observation", "h"], out_keys=["action", ("next", "h")])
         with pytest.raises(RuntimeError, match="no initial value for its state 'h'.*start from zeros"):
             evaluate(strict, make_env())
+    with pytest.raises(RuntimeError, match=r"cannot take observations of shape .*\(2,\).*trained in this environment"):
+        evaluate(make_policy(3, 2), make_env())

@@ -96,8 +96,14 @@ class ActorPolicy:
             if self._begun or not self.states:
                 raise
             raise ValueError(f"{self._stateless}, its first step fails ({error}): {_DEFAULT}") from error
+        except RuntimeError as error:
+            given_shapes = {key: tuple(given[key].shape[1:]) for key in self.inputs}
+            raise ValueError(
+                f"the actor cannot take observations of shape {given_shapes} ({error}): was it trained in this "
+                "environment?"
+            ) from error
         self._state = {key: written.get(source) for key, source in self.states.items()}
-        if any(state is None for state in self._state.values()):
+        if not all(isinstance(state, (Tensor, TensorDictBase)) for state in self._state.values()):
             raise ValueError(f"{self._stateless}, and writes none: {_DEFAULT}")
         self._begun = True
         action = written.get(self.action_key)[0].detach().cpu()

@@ -115,11 +115,11 @@ def act(policy: Policy, observation: Any) -> np.ndarray:
     try:
         with torch.no_grad():
             action = policy(observation)
-    except (TypeError, AttributeError) as error:
+    except (TypeError, AttributeError, RuntimeError) as error:
         if isinstance(policy, nn.Module):
             raise ValueError(
-                f"the module cannot take a NumPy observation ({error}): if it takes tensors, give the actor "
-                'TensorDictModule(module, in_keys=["observation"], out_keys=["action"])'
+                f"the module cannot take a NumPy observation of shape {np.shape(observation)} ({error}): if it takes "
+                'tensors, give the actor TensorDictModule(module, in_keys=["observation"], out_keys=["action"])'
             ) from error
         raise
     if isinstance(action, torch.Tensor):

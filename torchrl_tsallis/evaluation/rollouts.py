@@ -167,7 +167,9 @@ def _work(group: list[Task]) -> dict[Task, Episode]:
     except EpisodeError as failure:
         seed, error = failure.seed, failure.__cause__
         where = f" in {name_of(envs[0])}" if envs else ""
-        raise RuntimeError(f"policy {name!r}, episode {seed - first} (seed {seed}){where} failed: {error!r}") from error
+        raise RuntimeError(
+            f"policy {name!r}, episode {seed - first} (seed {seed}){where} failed: {type(error).__name__}: {error}"
+        ) from error
 
 
 def _run_pool(
