@@ -51,11 +51,11 @@ def checked_env_fn(env_fn: Any) -> EnvFn:
         ValueError: for a text that does not name a function of a module.
 
     Examples:
-        >>> checked_env_fn("Ant-v5")
+        >>> checked_env_fn("Robot-v1")
         Traceback (most recent call last):
         ...
-        ValueError: env_fn must be 'module:function' or a callable, got 'Ant-v5': for an environment's id, use
-        functools.partial(gymnasium.make, 'Ant-v5')
+        ValueError: env_fn must be 'module:function' or a callable, got 'Robot-v1': for an environment's id, use
+        functools.partial(gymnasium.make, 'Robot-v1')
     """
     if callable(env_fn):
         found: EnvFn = env_fn

@@ -52,7 +52,7 @@ def evaluate_policies(
     """Runs every policy on the same seeds in worker processes, each of which steps up to 4 environments in turn.
 
     A worker uses its environments again, so an episode must depend on the seed of ``reset`` alone once an environment
-    was reset before. The Ant's does; its physics is restored bit for bit.
+    was reset before, as one that restores its physics bit for bit.
 
     Networks are run in evaluation mode, whatever mode they are in; a policy with ``reset()`` begins each episode with a
     fresh copy. Modes, memories and the global random numbers are afterwards as they were, also after an error.
@@ -82,7 +82,7 @@ def evaluate_policies(
         RuntimeError: if an episode fails or keeps killing its worker, or no worker can start; the message names it.
 
     Examples:
-        >>> evaluate_policies({"zero": np.zeros_like}, env_fn="torchrl_tsallis.envs:make_ant", episodes=0)
+        >>> evaluate_policies({"zero": np.zeros_like}, env_fn="my_robot:make_env", episodes=0)
         Traceback (most recent call last):
         ...
         ValueError: episodes must be a whole number of at least 1, got episodes=0

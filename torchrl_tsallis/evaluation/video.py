@@ -59,10 +59,10 @@ def record_rollout(
         OSError: if the file cannot be written, or not completely; one that was there before is left as it was.
 
     Examples:
-        >>> record_rollout(np.zeros_like, "ant.avi", env_fn="torchrl_tsallis.envs:make_ant")
+        >>> record_rollout(np.zeros_like, "robot.avi", env_fn="my_robot:make_env")
         Traceback (most recent call last):
         ...
-        ValueError: cannot write 'ant.avi': use .gif or .mp4
+        ValueError: cannot write 'robot.avi': use .gif or .mp4
     """
     target = Path(path)
     if target.suffix.lower() not in WRITERS:
