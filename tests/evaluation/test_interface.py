@@ -133,11 +133,19 @@ BOX = spaces.Box(-9, 9, (2,), np.float32)
         ({"step": lambda self, action: (np.zeros(3), 0, True, False, {}), "observation_space": BOX}, r"\(3,\).*\(2,\)"),
         ({"look": lambda self: np.zeros((2, 1)), "observation_space": BOX}, r"reset of Small.*\(2, 1\).*\(2,\)"),
         ({"num_envs": 4}, "Small is a vector environment"),
+        ({"reset": lambda self: np.zeros(2)}, r"reset of Small takes no seed, needed is reset\(seed=...\)"),
+        ({"reset": None}, "env_fn made a Small, needed is an environment with reset and step"),
     ],
 )
 def test_answers_of_another_form_name_environment_and_fix(changes, message, make_env):
     with pytest.raises(RuntimeError, match=message):
         evaluate(constant(np.zeros(2)), make_env(**changes))
+
+
+def test_what_is_no_environment_at_all_is_named():
+    for made, name in ((None, "NoneType"), (3, "int"), (np.zeros, "function")):
+        with pytest.raises(RuntimeError, match=f"env_fn made a .*{name}.*, needed is an environment"):
+            evaluate(constant(np.zeros(2)), lambda made=made: made)
 
 
 def test_an_action_that_is_not_finite_for_an_observation_that_is_not_either_says_whose_fault_it_is(make_env):

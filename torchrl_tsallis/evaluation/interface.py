@@ -46,7 +46,14 @@ def begin(env: Any, seed: int, shape: tuple[int, ...] | None) -> Any:
         raise ValueError(
             f"{name_of(env)} is a vector environment: env_fn must make a single one, the steps are batched"
         )
-    given = env.reset(seed=seed)
+    if not (callable(getattr(env, "reset", None)) and callable(getattr(env, "step", None))):
+        raise ValueError(f"env_fn made a {name_of(env)}, needed is an environment with reset and step")
+    try:
+        given = env.reset(seed=seed)
+    except TypeError as error:
+        if "seed" not in str(error):
+            raise
+        raise ValueError(f"reset of {name_of(env)} takes no seed, needed is reset(seed=...), {_SHIM}") from error
     if not isinstance(given, tuple) or len(given) != 2:
         raise ValueError(f"reset of {name_of(env)} gave {_form(given)}, needed is (observation, info), {_SHIM}")
     return _observed(env, given[0], shape, "reset")

@@ -85,7 +85,7 @@ def record_rollout(
         try:
             frames = _frames(own_copy(own), env, seconds, fps, seed, size, step_seconds)
         finally:
-            env.close()
+            getattr(env, "close", lambda: None)()
     write(frames, target, fps)
     return target
 
@@ -113,7 +113,8 @@ def _frames(
     """Runs the episode and draws frame k at the first step at or after k / fps seconds."""
     if size is not None:
         # PyBullet's environments read the image's size from these attributes.
-        env.unwrapped._render_width, env.unwrapped._render_height = size
+        bare = getattr(env, "unwrapped", env)
+        bare._render_width, bare._render_height = size
     if step_seconds is None:
         rate = (getattr(env, "metadata", None) or {}).get("render_fps") or fps
         step_seconds = 1 / positive_number("metadata['render_fps']", rate)
