@@ -10,7 +10,15 @@ import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import nn
-from torchrl.modules import GRUModule, IndependentNormal, ProbabilisticActor, set_recurrent_mode
+from torch.distributions import Categorical
+from torchrl.modules import (
+    GRUModule,
+    IndependentNormal,
+    OneHotCategorical,
+    ProbabilisticActor,
+    QValueActor,
+    set_recurrent_mode,
+)
 
 from torchrl_tsallis.evaluation import ActorPolicy, MeanPolicy, evaluate_policies
 from torchrl_tsallis.modules import make_policy, make_recurrent_policy
@@ -153,3 +161,26 @@ def test_unclear_keys_are_refused_by_name_and_can_be_named(make_env):
             evaluate(strict, make_env())
     with pytest.raises(RuntimeError, match=r"cannot take observations of shape .*\(2,\).*trained in this environment"):
         evaluate(make_policy(3, 2), make_env())
+
+
+def test_a_compiled_actor_is_run_as_it_was_before(make_env):
+    torch.manual_seed(0)
+    actor = make_policy(2, 2)
+    assert evaluate(torch.compile(actor, backend="eager"), make_env()) == evaluate(actor, make_env())
+
+
+@pytest.mark.parametrize("kind", ["one-hot", "categorical", "value"])
+def test_torchrl_s_actors_of_discrete_actions_run(kind, make_env):
+    spaces = pytest.importorskip("gymnasium").spaces
+    torch.manual_seed(0)
+    network = TensorDictModule(nn.Linear(2, 3), in_keys=["observation"], out_keys=["logits"])
+    actor = {
+        "one-hot": lambda: ProbabilisticActor(network, in_keys=["logits"], distribution_class=OneHotCategorical),
+        "categorical": lambda: ProbabilisticActor(network, in_keys=["logits"], distribution_class=Categorical),
+        "value": lambda: QValueActor(nn.Linear(2, 3), in_keys=["observation"], action_space="one_hot"),
+    }[kind]()
+    env_fn = make_env(action_space=spaces.Discrete(3))
+    evaluate(actor, env_fn, episodes=1)
+    linear = actor.get_submodule("module.0.module") if kind == "value" else network.module
+    wanted = [int(linear(torch.tensor([10.0, t])).argmax()) for t in range(3)]
+    assert env_fn.actions_seen == wanted

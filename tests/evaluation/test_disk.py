@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import resource
 from contextlib import contextmanager
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -63,6 +64,45 @@ def test_a_place_that_cannot_be_written_is_named(name, tmp_path):
         with pytest.raises(OSError, match=f"cannot write '.*{path.name}'.*permissions"):
             write(path)
     assert sorted(part.name for part in tmp_path.iterdir()) == ["file", f"folder.{suffix}"]
+
+
+ROW = {"method": "bc", "task": "both", "std": 0.2, "seed": 0, "episode": 0, "return": 1.5, "trial": 0}
+FLIPS = dict.fromkeys(("flips", "events", "singles", "multiples", "run", "success"), 1)
+ROWS = [{**ROW, "episode": i} for i in range(2000)]
+
+
+@pytest.fixture(params=["returns", "growing returns", "raw returns", "trials"])
+def write_table(request, monkeypatch):
+    """A recipe's writer of raw results, and the error's way out."""
+    for package in ("hydra", "matplotlib"):
+        pytest.importorskip(package)
+    monkeypatch.syspath_prepend(str(Path(__file__).parents[2] / "recipes"))
+    import ant_report
+    import ant_units
+    import figure3_report
+    import flip_report
+
+    counts = [{name: row[name] for name in ("method", "seed", "trial")} | FLIPS for row in ROWS]
+    return {
+        "returns": (lambda path: ant_report.save_returns(path, ROWS), "another output folder"),
+        "growing returns": (lambda path: ant_units.ReturnsTable(path).append(ROWS), "complete rows are kept"),
+        "raw returns": (lambda path: figure3_report.save_raw(path, ROWS), "another output folder"),
+        "trials": (lambda path: flip_report.save_rows(path, counts), "another output folder"),
+    }[request.param]
+
+
+def test_a_table_of_results_on_a_full_or_closed_disk_keeps_what_it_has(write_table, tmp_path):
+    write, way_out = write_table
+    path = tmp_path / "table.csv"
+    write(path)
+    good = path.read_bytes()
+    with little_space(), pytest.raises(OSError, match=f"cannot write '.*table.csv'.*free space.*{way_out}"):
+        write(path)
+    assert path.read_bytes().startswith(good)  # the growing one may have rows more
+    assert list(tmp_path.iterdir()) == [path]
+    for place in (path / "table.csv", tmp_path):
+        with pytest.raises(OSError, match="cannot write .*permissions"):
+            write(place)
 
 
 def test_a_figure_is_a_png_or_refused(tmp_path):

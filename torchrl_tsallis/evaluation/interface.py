@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-_SHIM = "as Gymnasium's environments give; wrap one of another interface (older gym: shimmy.GymV21CompatibilityV0)"
+_SHIM = "as Gymnasium's environments give; wrap an older gym's (shimmy.GymV21CompatibilityV0), make what TorchRL's wrap"
 
 
 def name_of(env: Any) -> str:
@@ -105,7 +105,8 @@ class ActionRule:
     space                       rule
     =========================== =====================================================================
     Box                         clipped to its limits; of whole numbers, only such are taken
-    Discrete, MultiDiscrete     whole numbers within the limits; nothing is clipped or rounded
+    Discrete                    a whole number within the limits, or whole numbers that are one-hot, as TorchRL's
+    MultiDiscrete               whole numbers within the limits; nothing is clipped or rounded
     MultiBinary                 0 or 1 (or bool)
     Dict, Tuple, any other one  refused by name
     =========================== =====================================================================
@@ -145,9 +146,12 @@ class ActionRule:
         self.shape = self.low.shape
         self.dtype = self.low.dtype if self.clipped else np.dtype(getattr(space, "dtype", None) or self.low.dtype)
         self.whole = self.dtype.kind != "f"
+        self.classes = int(high - low) + 1 if not self.clipped and self.shape == () else 0  # of Discrete
 
     def legal(self, actions: Sequence[np.ndarray] | np.ndarray) -> Sequence[np.ndarray] | np.ndarray | None:
         """Actions of the space for outputs ``[E, *A]``, or None if :meth:`fault` finds one in any of them."""
+        if self.classes:
+            actions = [self._index(action) for action in actions]
         # All outputs are tested at once, for speed, as they are clipped, which is np.clip's result.
         if any(action.shape != self.shape for action in actions) or not np.isfinite(actions).all():
             return None
@@ -158,6 +162,12 @@ class ActionRule:
         legal = np.minimum(np.maximum(actions, self.low), self.high).astype(self.dtype, copy=False)
         # A number of a Box is an array without dimensions, one of Discrete a scalar.
         return [np.array(action) for action in legal] if self.clipped and self.shape == () else legal
+
+    def _index(self, action: np.ndarray) -> np.ndarray:
+        """What a one-hot output for Discrete says; others stay as they are."""
+        if action.shape != (self.classes,) or action.dtype.kind not in "biu" or np.sort(action)[-2:].sum() != 1:
+            return action
+        return self.low + action.argmax()
 
     def fault(self, action: np.ndarray) -> str | None:
         """What is wrong with one output ``[*A]``; None if nothing is."""
@@ -172,8 +182,8 @@ class ActionRule:
             ends = f"{low[0]} to {high[-1]}" if len(low) == len(high) == 1 else f"{self.low} to {self.high}"
             what += f", from {ends}"
         hint = ""
-        if self.whole and self.shape == () and action.shape == (int(self.high - self.low) + 1,):
-            hint = ": if these are scores or a one-hot vector, return np.argmax of them"
+        if self.classes and action.shape == (self.classes,):
+            hint = ": if these are scores, return np.argmax of them"
         return f"need {what} for {self.env}, got {action}{hint}"
 
 

@@ -47,8 +47,9 @@ def as_policy(name: str, given: Any) -> Policy:
         TypeError: policy 'mine' is an int: needed is a callable, observation -> action, an actor, or its state_dict
     """
     try:
-        if isinstance(given, TensorDictModuleBase):
-            return ActorPolicy(given)
+        bare = getattr(given, "_orig_mod", given) if isinstance(given, nn.Module) else given  # of torch.compile
+        if isinstance(bare, TensorDictModuleBase):
+            return ActorPolicy(bare)
         if callable(given) and not isinstance(given, type):
             return given
         if isinstance(given, Mapping):
