@@ -119,7 +119,7 @@ def measure(policy: MeanPolicy, actions: list[np.ndarray]) -> dict[str, float]:
     package = make_environment(lambda: gymnasium.make("pybullet_envs_gymnasium:AntBulletEnv-v0"), SEED)
 
     def evaluating(policy: Callable, count: int) -> Callable[[], int]:
-        return lambda: sum(length for _, length in run_episodes(policy, envs, [SEED] * count))
+        return lambda: sum(episode.length for episode in run_episodes(policy, envs, [SEED] * count))
 
     runs = {
         "physics alone": physics(make_environment(make_ant, SEED), actions),
@@ -160,7 +160,7 @@ def main() -> None:
     for _, result in finished_jobs(partial(measure, policy), [actions, actions], workers=2):
         show("one of two processes at once", result)
     before = time.perf_counter()
-    evaluate_policies({"clone": policy}, episodes=2, workers=2, progress=False)
+    evaluate_policies({"clone": policy}, env_fn=make_ant, episodes=2, workers=2, progress=False)
     print(f"evaluate_policies of 2 episodes on 2 workers: {time.perf_counter() - before:.1f} s, most of it their start")
 
 

@@ -45,6 +45,7 @@ def train(members: int, steps: int, threads: int) -> dict[str, float]:
 def evaluate(workers: int, environments: int, episodes: int) -> dict[str, float]:
     """Environment steps per second of an expert, by the wall clock, after the workers' start."""
     from torchrl_tsallis.data import load_policy
+    from torchrl_tsallis.envs import make_ant
     from torchrl_tsallis.evaluation import evaluate_policies, rollouts
 
     rollouts.GROUP = environments  # of this process alone: with workers, they get it by their groups' sizes
@@ -54,7 +55,7 @@ def evaluate(workers: int, environments: int, episodes: int) -> dict[str, float]
     lengths = 0
     for count in (workers or 1, (workers or 1) + episodes):
         start = time.perf_counter()
-        rows = evaluate_policies({"expert": policy}, episodes=count, workers=workers, progress=False)
+        rows = evaluate_policies({"expert": policy}, env_fn=make_ant, episodes=count, workers=workers, progress=False)
         spent.append(time.perf_counter() - start)
         lengths = sum(row["length"] for row in rows) - lengths
     return {"rate": lengths / max(spent[1] - spent[0], 1e-9)}

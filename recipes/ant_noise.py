@@ -30,10 +30,12 @@ from torchrl._utils import logger as torchrl_logger
 
 import torchrl_tsallis.trainers.configs  # noqa: F401 (registers the groups that the YAML file names)
 from torchrl_tsallis.data import make_replay_buffer, validate_demonstrations
+from torchrl_tsallis.envs import make_ant
 from torchrl_tsallis.evaluation import MeanPolicy, evaluate_policies, median, record_rollout
 from torchrl_tsallis.jobs import atomic_path, run_jobs, tick
 from torchrl_tsallis.trainers import LoggerGroup, make_logger, resume
 
+STEP_SECONDS = 0.0165  # s of the Ant's simulated time
 Unit = tuple[str, int, str]  # task, seed, method: one training
 
 
@@ -97,13 +99,16 @@ def evaluate(units: list[Unit], cfg: DictConfig) -> None:
         folders = {unit[2]: folder_of(unit, cfg) for unit in units if unit[:2] == (task, seed)}
         states = {method: load_file(folder / "policy.safetensors") for method, folder in folders.items()}
         policies = {method: MeanPolicy.from_actor_state(state) for method, state in states.items()}
-        rows = evaluate_policies(policies, workers=cfg.workers, progress=cfg.progress, **cfg.evaluation)
+        rows = evaluate_policies(
+            policies, env_fn=make_ant, workers=cfg.workers, progress=cfg.progress, **cfg.evaluation
+        )
         for method, folder in folders.items():
             own = [{**row, "method": method, "task": task, "seed": seed} for row in rows if row["policy"] == method]
             logger = unit_logger((task, seed, method), cfg)
             logger.log_scalar("eval/return_median", median([row["return"] for row in own]))
             if cfg.video and seed == as_list(cfg.seed)[0]:
-                logger.log_video("eval/video", record_rollout(policies[method], folder / "rollout.gif"))
+                video = {"env_fn": make_ant, "step_seconds": STEP_SECONDS}
+                logger.log_video("eval/video", record_rollout(policies[method], folder / "rollout.gif", **video))
             logger.shutdown()
             save_returns(folder / "returns.csv", own)
 

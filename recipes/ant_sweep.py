@@ -20,6 +20,7 @@ from torchrl._utils import logger as torchrl_logger
 
 import torchrl_tsallis.trainers.configs  # noqa: F401 (registers the groups that the YAML file names)
 from torchrl_tsallis.data import make_stacked_replay_buffer
+from torchrl_tsallis.envs import make_ant
 from torchrl_tsallis.evaluation import MeanPolicy, evaluate_policies
 from torchrl_tsallis.jobs import atomic_path, run_jobs, run_jobs_on_ray, tick
 from torchrl_tsallis.trainers import keep_freed_memory, make_logger, resume
@@ -104,6 +105,7 @@ def evaluate(unit: Unit, cfg: DictConfig) -> None:
             own = {name.removeprefix(start): value for name, value in states.items() if name.startswith(start)}
             rows = evaluate_policies(
                 {key.method: MeanPolicy.from_actor_state(own)},
+                env_fn=make_ant,
                 episodes=cfg.evaluation.episodes - first,
                 seed=cfg.evaluation.seed + first,
                 workers=0,  # none but this process

@@ -88,15 +88,22 @@ class ReturnsTable:
 
     def append(self, rows: Sequence[Mapping[str, Any]]) -> None:
         """Adds rows, and returns once they are on the disk."""
-        self.path.parent.mkdir(parents=True, exist_ok=True)
-        with open(self.path, "a+b") as file:
-            fcntl.flock(file, fcntl.LOCK_EX)
-            file.seek(0)
-            whole = file.read().rfind(b"\n") + 1
-            file.truncate(whole)  # what a process that was killed has left of a line
-            file.write(as_csv(rows, header=whole == 0).encode())
-            file.flush()
-            os.fsync(file.fileno())
+        try:
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            with open(self.path, "a+b") as file:
+                fcntl.flock(file, fcntl.LOCK_EX)
+                file.seek(0)
+                whole = file.read().rfind(b"\n") + 1
+                file.truncate(whole)  # what a process that was killed has left of a line
+                file.write(as_csv(rows, header=whole == 0).encode())
+                file.flush()
+                os.fsync(file.fileno())
+        except OSError as error:
+            raise OSError(
+                error.errno,
+                f"cannot write {str(self.path)!r} ({error.strerror or error}): check the folder's permissions and the "
+                "free space of its disk; complete rows are kept, and the same command goes on after them",
+            ) from error
 
 
 @dataclass(frozen=True)

@@ -144,7 +144,7 @@ def flip(unit: Unit, cfg: DictConfig) -> None:
     if cfg.video and seed == as_list(cfg.seed)[0]:
         policy.reset()
         settings = {"seconds": 0.02 * cfg.data.steps, "seed": cfg.trials.seed, "env_fn": make_page_flip}
-        record_rollout(policy, folder / "rollout.gif", step_seconds=0.02, **settings)
+        record_rollout(policy, folder / "rollout.gif", step_seconds=0.02, size=(320, 240), **settings)
     save_rows(folder / "trials.csv", rows)  # last: it marks the trials as done
 
 

@@ -1,13 +1,18 @@
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 import torch
 
 from torchrl_tsallis.data import load_policy
+from torchrl_tsallis.envs import make_ant
 from torchrl_tsallis.evaluation import MeanPolicy, evaluate_policies
 from torchrl_tsallis.evaluation.episodes import run_episode
-from torchrl_tsallis.modules import make_policy
+from torchrl_tsallis.modules import make_policy, make_recurrent_policy
 
 # Written to a module of its own, because a spawned worker must be able to import it.
 DUMMY = '''
@@ -89,6 +94,20 @@ class Batched:
 def picky(observation):
     assert observation.shape == (2,)
     return np.full(2, np.nan if observation[0] == 11 else 0.5)
+
+
+class Remembering:
+    """Acts by the number of its calls since ``reset``."""
+
+    def __init__(self):
+        self.calls = 7
+
+    def reset(self):
+        self.calls = 0
+
+    def __call__(self, observation):
+        self.calls += 1
+        return np.full(2, 0.1 * self.calls)
 
 
 def half(observation):
@@ -222,6 +241,49 @@ def test_action_of_a_row_does_not_depend_on_the_batch():
             np.testing.assert_array_equal(policy(observations[:size]), alone[:size])
 
 
+def test_networks_and_memories_give_the_same_in_workers_as_in_this_process(dummy):
+    torch.manual_seed(0)
+    actor, recurrent = make_policy(2, 2), make_recurrent_policy(2, 2, state_noise=0.5)
+    policies = {"actor": actor, "recurrent": recurrent, "remembering": dummy.Remembering()}
+    results = [
+        evaluate_policies(policies, episodes=5, seed=10, workers=workers, env_fn=dummy.Env, progress=False)
+        for workers in (0, 1)
+    ]
+    assert results[0] == results[1]
+    # 3 x the seed and 2 x (0.1 + 0.2 + 0.3)
+    assert [row["return"] for row in results[1][10:]] == pytest.approx([3 * seed + 1.2 for seed in range(10, 15)])
+    assert actor.training and recurrent.training and policies["remembering"].calls == 7
+
+
+SCRIPTS = {
+    "without a guard": (
+        "import dummy_rollout_env as dummy\nfrom torchrl_tsallis.evaluation import evaluate_policies\n"
+        "evaluate_policies({'half': dummy.half}, episodes=2, workers=1, env_fn=dummy.Env, progress=False)\n",
+        "a worker process cannot run the main script again",
+    ),
+    "with a policy that a worker cannot import": (
+        "import dummy_rollout_env as dummy\nfrom torchrl_tsallis.evaluation import evaluate_policies\n"
+        "if __name__ == '__main__':\n    def mine(observation):\n        return dummy.half(observation)\n"
+        "    evaluate_policies({'mine': mine}, episodes=2, workers=1, env_fn=dummy.Env, progress=False)\n",
+        "no worker process could start",
+    ),
+}
+
+
+@pytest.mark.parametrize("kind", SCRIPTS)
+def test_a_script_whose_workers_cannot_start_is_told_what_to_do(kind, dummy, tmp_path):
+    text, said = SCRIPTS[kind]
+    (tmp_path / "script.py").write_text(text)
+    paths = os.pathsep.join([str(tmp_path), *sys.path])
+    environment = os.environ | {"PYTHONPATH": paths, "OMP_NUM_THREADS": "1"}
+    command = [sys.executable, str(tmp_path / "script.py")]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 1 and said in done.stderr
+    last = done.stderr.strip().splitlines()[-1]
+    assert last.startswith("RuntimeError: no worker process could start: put what the script does under if __name__")
+    assert "check memory" not in done.stderr
+
+
 @pytest.mark.filterwarnings("ignore")
 def test_ant_does_not_depend_on_workers_and_groups(monkeypatch):
     pytest.importorskip("pybullet")
@@ -231,7 +293,7 @@ def test_ant_does_not_depend_on_workers_and_groups(monkeypatch):
     results = []
     for workers, group in [(0, 4), (0, 1), (2, 2)]:
         monkeypatch.setattr("torchrl_tsallis.evaluation.rollouts.GROUP", group)
-        results.append(evaluate_policies(policies, episodes=3, workers=workers, progress=False))
+        results.append(evaluate_policies(policies, env_fn=make_ant, episodes=3, workers=workers, progress=False))
     assert results[0] == results[1] == results[2]
     assert results[0][0]["return"] != results[0][1]["return"]
     for row in (results[0][2], results[0][5]):  # the last of each policy, in a fresh environment

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from torchrl_tsallis.evaluation.actor_policy import ActorPolicy
 from torchrl_tsallis.evaluation.flip_plots import error_curves, flip_trajectories, force_over_time, ratings_over_time
 from torchrl_tsallis.evaluation.flip_trials import FlipTrial, longest_single_run, run_flip_trial
 from torchrl_tsallis.evaluation.grid_plots import returns_grid
@@ -20,6 +21,7 @@ from torchrl_tsallis.evaluation.statistics import (
 from torchrl_tsallis.evaluation.video import record_rollout
 
 __all__ = [
+    "ActorPolicy",
     "FlipTrial",
     "MeanPolicy",
     "RecurrentMeanPolicy",

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from torchrl_tsallis.envs.flips import FlipCount, count_flips
+from torchrl_tsallis.evaluation.ownership import act, as_policy, left_as_found
 
 #: Successive single flips that make a trial a success.
 SUCCESS_RUN = 3
@@ -64,10 +65,12 @@ def longest_single_run(sizes: Sequence[int] | np.ndarray) -> int:
 def run_flip_trial(policy: Any, seed: int, *, make_env: Callable[[], Any] | None = None) -> FlipTrial:
     """Lets a policy flip pages for one trial.
 
-    The environment shortens a force beyond the arm's 3.3 N. A trial depends on policy and seed alone.
+    The environment shortens a force beyond the arm's 3.3 N. A trial depends on policy and seed alone. The policy's mode
+    and the random numbers are left as they were.
 
     Args:
-        policy: observation ``[12]`` -> force ``[3]`` in N. Its ``reset()``, if it has one, is called first.
+        policy: observation ``[12]`` -> force ``[3]`` in N, or an actor of TorchRL. Its ``reset()``, if it has one, is
+            called first.
         seed: of the trial.
         make_env: makes the environment. Default: :func:`~torchrl_tsallis.envs.page_flip.make_page_flip`.
 
@@ -81,7 +84,12 @@ def run_flip_trial(policy: Any, seed: int, *, make_env: Callable[[], Any] | None
         from torchrl_tsallis.envs.page_flip import make_page_flip
 
         make_env = make_page_flip
-    env = make_env()
+    policy = as_policy("policy", policy)
+    with left_as_found([policy]):
+        return _run(policy, seed, make_env())
+
+
+def _run(policy: Any, seed: int, env: Any) -> FlipTrial:
     try:
         observation, info = env.reset(seed=seed)
         getattr(policy, "reset", lambda: None)()
@@ -90,7 +98,7 @@ def run_flip_trial(policy: Any, seed: int, *, make_env: Callable[[], Any] | None
         angles: list[np.ndarray] = [info["edge_angles"]]
         over = False
         while not over:
-            force = np.asarray(policy(observation))
+            force = act(policy, observation)
             if force.shape != (3,) or not np.isfinite(force).all():
                 raise ValueError(f"step {len(forces)} of seed {seed}: need a finite force [3] in N, got {force}")
             positions.append(observation[:3])

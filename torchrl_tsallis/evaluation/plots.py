@@ -30,6 +30,8 @@ def _canvas(width: float, height: float) -> Any:
 
 def _save(figure: Any, path: str | os.PathLike[str]) -> Path:
     """Writes a figure as PNG, atomically."""
+    if Path(path).suffix.lower() != ".png":
+        raise ValueError(f"cannot write {str(path)!r}: use .png")
     with atomic_path(path) as temporary:
         figure.savefig(temporary, format="png")
     return Path(path)

@@ -1,105 +1,162 @@
-"""A short video of a policy, drawn by PyBullet's software renderer."""
+"""A short video of a policy."""
 
 from __future__ import annotations
 
+import importlib.util
+import logging
 import os
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from torchrl_tsallis.evaluation.episodes import EnvFn, Policy, resolve
-from torchrl_tsallis.evaluation.rollouts import DEFAULT_ENV
-from torchrl_tsallis.jobs import atomic_path
+from torchrl_tsallis.evaluation.episodes import EnvFn, resolve
+from torchrl_tsallis.evaluation.interface import ActionRule, begin, name_of, observation_shape, take
+from torchrl_tsallis.evaluation.ownership import act, as_policy, left_as_found, own_copy
+from torchrl_tsallis.evaluation.settings import positive_number, whole_number
+from torchrl_tsallis.evaluation.video_files import WRITERS
+
+_LOGGER = logging.getLogger(__name__)
 
 
 def record_rollout(
-    policy: Policy,
+    policy: Any,
     path: str | os.PathLike[str],
     *,
+    env_fn: EnvFn,
     seconds: float = 6.0,
-    fps: int = 15,
+    fps: float = 15,
     seed: int = 10_000,
-    size: tuple[int, int] = (320, 240),
-    env_fn: EnvFn = DEFAULT_ENV,
-    step_seconds: float = 0.0165,
+    size: tuple[int, int] | None = None,
+    step_seconds: float | None = None,
 ) -> Path:
     """Records the start of an episode as ``.gif`` (needs pillow) or ``.mp4`` (needs imageio-ffmpeg).
 
-    The episode is the one that :func:`~torchrl_tsallis.evaluation.evaluate_policies` runs with this seed.
+    The episode is the one that :func:`~torchrl_tsallis.evaluation.evaluate_policies` runs with this seed, and the
+    policy's mode and memory and the random numbers are left as they were, as there. The video has the size that the
+    environment renders; ``.mp4`` repeats the last column or row of an odd one, because H.264 needs an even size.
 
     Args:
-        policy: observation -> action, clipped to the action space.
+        policy: observation -> action, an actor of TorchRL, or an actor's state, as for ``evaluate_policies``.
         path: file to write.
+        env_fn: makes the environment, called with ``render_mode="rgb_array"``.
         seconds: longest duration (6); it ends with the episode.
         fps: frames a second (15); the video plays in real time.
         seed: of the episode (10000).
-        size: width and height in pixels (320 x 240).
-        env_fn: makes the environment, called with ``render_mode="rgb_array"``.
-        step_seconds: simulated time of a step (0.0165 s, the PyBullet locomotion robots).
+        size: width and height in pixels, for environments that read ``_render_width`` and ``_render_height`` as
+            PyBullet's do. Default: what the environment renders.
+        step_seconds: simulated time of a step, s. Default: that of the environment's ``metadata["render_fps"]``; where
+            it has none, every step is one frame.
 
     Returns:
         The path.
 
     Raises:
-        ValueError: if the suffix or a number is not supported.
-        OSError: if the file cannot be written.
+        ImportError: if the format's package is missing.
+        ValueError: if the suffix or a number is not supported, the environment does not render frames
+            ``[height, width, 3]`` of uint8 and of one size, or an action is none.
+        OSError: if the file cannot be written, or not completely; one that was there before is left as it was.
 
     Examples:
-        >>> record_rollout(np.zeros_like, "ant.avi")
+        >>> record_rollout(np.zeros_like, "robot.avi", env_fn="my_robot:make_env")
         Traceback (most recent call last):
         ...
-        ValueError: cannot write 'ant.avi': use .gif or .mp4
+        ValueError: cannot write 'robot.avi': use .gif or .mp4
     """
     target = Path(path)
-    if target.suffix not in (".gif", ".mp4"):
+    if target.suffix.lower() not in WRITERS:
         raise ValueError(f"cannot write {str(target)!r}: use .gif or .mp4")
-    if seconds <= 0 or fps <= 0 or step_seconds <= 0 or min(size) < 16:
-        raise ValueError(f"seconds, fps, step_seconds and size must be positive: {seconds=}, {fps=}, {size=}")
-    frames = _frames(policy, seconds, fps, seed, size, env_fn, step_seconds)
-    with atomic_path(target) as temporary:
-        if target.suffix == ".gif":
-            from PIL import Image
-
-            images = [Image.fromarray(frame) for frame in frames]
-            images[0].save(
-                temporary, save_all=True, append_images=images[1:], duration=round(1000 / fps), loop=0, optimize=True
-            )
-        else:
-            import imageio_ffmpeg
-
-            writer = imageio_ffmpeg.write_frames(str(temporary), size, fps=fps, macro_block_size=2)
-            writer.send(None)
-            for frame in frames:
-                writer.send(np.ascontiguousarray(frame))
-            writer.close()
+    module, package, write = WRITERS[target.suffix.lower()]
+    seconds, fps, seed = positive_number("seconds", seconds), positive_number("fps", fps), whole_number("seed", seed, 0)
+    if step_seconds is not None:
+        positive_number("step_seconds", step_seconds)
+    if target.suffix.lower() == ".gif" and fps > 100:
+        raise ValueError(f"a .gif has at most 100 frames a second, got fps={fps:g}: choose less, or .mp4")
+    if size is not None:
+        if not isinstance(size, (tuple, list)) or len(size) != 2:
+            raise ValueError(f"size must be (width, height) in pixels, got {size!r}")
+        size = whole_number("width", size[0], 16), whole_number("height", size[1], 16)
+    if importlib.util.find_spec(module) is None:
+        raise ImportError(f"writing {target.suffix} needs {package}: pip install {package}")
+    own = as_policy("policy", policy)
+    with left_as_found([own]):
+        env = _make(resolve(env_fn))
+        try:
+            frames = _frames(own_copy(own), env, seconds, fps, seed, size, step_seconds)
+        finally:
+            getattr(env, "close", lambda: None)()
+    write(frames, target, fps)
     return target
 
 
+def _make(env_fn: Callable[..., Any]) -> Any:
+    """Makes an environment that renders images."""
+    try:
+        return env_fn(render_mode="rgb_array")
+    except TypeError as error:
+        if "render_mode" not in str(error):
+            raise
+        name = getattr(env_fn, "__name__", repr(env_fn))
+        raise TypeError(f"env_fn {name} must take render_mode='rgb_array' and hand it to the environment") from error
+
+
 def _frames(
-    policy: Policy,
+    policy: Callable[[Any], Any],
+    env: Any,
     seconds: float,
-    fps: int,
+    fps: float,
     seed: int,
-    size: tuple[int, int],
-    env_fn: EnvFn,
-    step_seconds: float,
+    size: tuple[int, int] | None,
+    step_seconds: float | None,
 ) -> list[np.ndarray]:
     """Runs the episode and draws frame k at the first step at or after k / fps seconds."""
-    env = resolve(env_fn)(render_mode="rgb_array")
-    try:
+    if size is not None:
         # PyBullet's environments read the image's size from these attributes.
-        env.unwrapped._render_width, env.unwrapped._render_height = size
-        env.reset(seed=seed)
-        observation, _ = env.reset(seed=seed)
-        low, high = env.action_space.low, env.action_space.high
-        frames: list[np.ndarray] = []
-        steps, done = 0, False
-        while not done and steps * step_seconds < seconds:
-            if steps * step_seconds >= len(frames) / fps:
-                frames.append(np.asarray(env.render(), dtype=np.uint8)[..., :3])
-            action = np.clip(policy(observation), low, high).astype(low.dtype)
-            observation, _, terminated, truncated, _ = env.step(action)
-            steps, done = steps + 1, bool(terminated or truncated)
-        return frames
-    finally:
-        env.close()
+        bare = getattr(env, "unwrapped", env)
+        bare._render_width, bare._render_height = size
+    if step_seconds is None:
+        rate = (getattr(env, "metadata", None) or {}).get("render_fps") or fps
+        step_seconds = 1 / positive_number("metadata['render_fps']", rate)
+    rule, shape = ActionRule(env), observation_shape(env)
+    begin(env, seed, shape)  # as make_environment: PyBullet's first episode differs
+    observation = begin(env, seed, shape)
+    batched = getattr(policy, "batched", False)
+    frames: list[np.ndarray] = []
+    steps, done = 0, False
+    while not done and steps * step_seconds < seconds:
+        if steps * step_seconds >= len(frames) / fps:
+            frames.append(_checked_frame(env, frames))
+        action = act(policy, np.array([observation]))[0] if batched else act(policy, observation)
+        legal = rule.legal([action])
+        if legal is None:
+            raise ValueError(f"step {steps}: {rule.fault(action)}")
+        observation, _, terminated, truncated = take(env, legal[0], shape)
+        steps, done = steps + 1, terminated or truncated
+    height, width = frames[0].shape[:2]
+    if size is not None and size != (width, height):
+        _LOGGER.warning("%s renders %d x %d pixels, not the size %d x %d", name_of(env), width, height, *size)
+    return frames
+
+
+def _checked_frame(env: Any, before: list[np.ndarray]) -> np.ndarray:
+    """Renders a frame ``[height, width, 3]`` of uint8, which has the size of the ones before."""
+    given, name = env.render(), name_of(env)
+    if given is None:
+        raise ValueError(f"{name} renders None: env_fn must hand render_mode='rgb_array' to the environment")
+    frame = np.asarray(given) if isinstance(given, np.ndarray) else np.asarray(None)
+    if frame.ndim == 2:
+        frame = frame[..., None]
+    if frame.ndim != 3 or frame.shape[2] not in (1, 3, 4) or frame.dtype != np.uint8 or not frame.size:
+        found = (
+            f"{given.dtype} of shape {given.shape}" if isinstance(given, np.ndarray) else f"a {type(given).__name__}"
+        )
+        raise ValueError(
+            f"{name} renders {found}, needed are arrays [height, width, 3] of uint8: have the environment's render "
+            "return such, such as np.rint(255 * image).astype(np.uint8) of an image in [0, 1]"
+        )
+    frame = np.repeat(frame, 3, 2) if frame.shape[2] == 1 else frame[..., :3].copy()
+    if before and frame.shape != before[0].shape:
+        sizes = " and ".join(f"{part.shape[1]} x {part.shape[0]}" for part in (before[0], frame))
+        raise ValueError(f"{name} renders frames of {sizes} pixels in one episode: a video needs one size")
+    return frame

@@ -1,0 +1,57 @@
+"""Checks of settings, made before anything runs."""
+
+from __future__ import annotations
+
+import math
+import numbers
+from typing import Any
+
+
+def whole_number(name: str, value: Any, least: int) -> int:
+    """Checks a whole number.
+
+    Args:
+        name: of the setting, for the message.
+        value: what was given; a bool is no number.
+        least: smallest one that is allowed.
+
+    Returns:
+        The number as an int.
+
+    Raises:
+        ValueError: if it is none or too small; the message names setting and value.
+
+    Examples:
+        >>> whole_number("episodes", 2.5, 1)
+        Traceback (most recent call last):
+        ...
+        ValueError: episodes must be a whole number of at least 1, got episodes=2.5
+    """
+    if isinstance(value, bool) or not isinstance(value, numbers.Integral) or value < least:
+        raise ValueError(f"{name} must be a whole number of at least {least}, got {name}={value!r}")
+    return int(value)
+
+
+def positive_number(name: str, value: Any) -> float:
+    """Checks a positive, finite number.
+
+    Args:
+        name: of the setting, for the message.
+        value: what was given; a bool is no number.
+
+    Returns:
+        The number as a float.
+
+    Raises:
+        ValueError: if it is none, not positive, NaN or infinite; the message names setting and value.
+
+    Examples:
+        >>> positive_number("fps", float("nan"))
+        Traceback (most recent call last):
+        ...
+        ValueError: fps must be a positive number, got fps=nan
+    """
+    good = isinstance(value, numbers.Real) and not isinstance(value, bool)
+    if not good or not math.isfinite(value) or value <= 0:
+        raise ValueError(f"{name} must be a positive number, got {name}={value!r}")
+    return float(value)
