@@ -336,6 +336,8 @@ def test_a_rating_is_the_mean_of_seeded_draws(kind):
     assert torch.equal(many[0], many[1]) and not torch.equal(many[0], many[2])
     single = [loss.rating(data, seed=seed) for seed in (0, 1)]
     assert torch.equal(single[0], one)
+    loss.dims, loss.draws = loss.rating_module.dims, 64
+    assert torch.equal(loss.rating(data), many[0]), "as in training, if nothing is said"
     assert (many[0] - many[2]).abs().mean() < 0.4 * (single[0] - single[1]).abs().mean()
 
 
@@ -364,6 +366,44 @@ def test_it_trains_in_torchrls_trainer_with_its_tuner(kind, tmp_path):
     assert loss.rating_module.u != 0.2 and loss.scale.batches == 8
     rating = loss.rating(random_data(5))
     assert rating.shape == (5,) and ((rating > 0) & (rating <= 1)).all()
+
+
+def test_extra_passes_rate_without_changing_the_gradients_pass():
+    torch.manual_seed(0)
+    net = diffusion_loss()
+    data = random_data(200)
+    grads = []
+    for draws in (0, 3):
+        loss = RatedLoss(deepcopy(net), rating=PeakRating(u=0.0), draws=draws)
+        torch.manual_seed(1)
+        out = loss(data)
+        grads.append(torch.autograd.grad(out["loss_diffusion_bc"], list(loss.parameters())))
+        assert loss.rating_module.dims == (2 if draws == 0 else 6)
+    torch.testing.assert_close(*grads)  # with u = 0 every sample counts 1, whatever it was rated by
+
+    torch.manual_seed(1)
+    loss(data)
+    torch.manual_seed(1)
+    net(data)
+    mean = torch.stack([net(data)["loss_diffusion_bc"].mean(-1) for _ in range(3)]).mean(0)
+    distance, _ = loss.last_evidence
+    torch.testing.assert_close(distance / distance.mean(), (mean / mean.mean()).detach())
+
+
+@pytest.mark.parametrize("kind", MAKE)
+def test_random_losses_are_rejected_where_their_actions_are_far_off(kind):
+    torch.manual_seed(0)
+    loss, data = MAKE[kind](), random_data(256)
+    data["action"] = data["observation"][:, :2].tanh()
+    data["vla_action", "chunk"] = data["action"][:, None].expand(-1, 4, -1).clone()
+    data["action"][:20], data["vla_action", "chunk"][:20] = 8.0, 8.0
+    optimizer = torch.optim.Adam(loss.parameters(), lr=3e-3)
+    for _ in range(30):
+        loss(data)[loss.loss_key].backward()
+        optimizer.step()
+        optimizer.zero_grad()
+    rating = loss.rating(data, draws=8)
+    assert auroc(-rating[:20].numpy(), -rating[20:].numpy()) > 0.9
 
 
 def test_other_outputs_are_means_that_no_trainer_sums():
@@ -450,7 +490,7 @@ def test_what_does_not_fit_is_named():
         with pytest.raises(ValueError, match=name):
             RatedLoss(bc_loss(net), **{name: wrong})
     with pytest.raises(ValueError, match="draws"):
-        RatedLoss(bc_loss(net)).rating(random_data(3), draws=0)
+        RatedLoss(bc_loss(net)).rating(random_data(3), draws=-1)
     with pytest.raises(KeyError, match="no 'loss_other'.*loss_key"):
         RatedLoss(bc_loss(net), loss_key="loss_other")(random_data(3))
     with pytest.raises(NotImplementedError, match="distribution"):

@@ -100,12 +100,12 @@ def split_far(
 
 
 def losses_of_samples(
-    outputs: Sequence[TensorDictBase], key: NestedKey, shape: torch.Size, mask: Tensor | None
+    output: TensorDictBase, key: NestedKey, shape: torch.Size, mask: Tensor | None
 ) -> tuple[Tensor, int]:
-    """The loss of each sample, averaged over draws and over what dimensions it has beside those of the batch.
+    """The loss of each sample, averaged over what dimensions it has beside those of the batch.
 
     Args:
-        outputs: of the loss, one a draw.
+        output: of the loss.
         key: of the loss.
         shape: ``[*B]``.
         mask: valid samples, ``[*B]`` bool. Default: None, all.
@@ -120,13 +120,12 @@ def losses_of_samples(
     Examples:
         >>> from tensordict import TensorDict
         >>> out = TensorDict({"loss": torch.tensor([[1.0, 3.0], [5.0, 7.0]])})
-        >>> losses_of_samples([out], "loss", torch.Size([2]), None)
+        >>> losses_of_samples(out, "loss", torch.Size([2]), None)
         (tensor([2., 6.]), 2)
     """
-    found = [out.get(key, None) for out in outputs]
-    if found[0] is None:
-        raise KeyError(f"the loss returns {sorted(map(str, outputs[0].keys(True, True)))}, no {key!r}: see loss_key")
-    losses: Any = torch.stack(found).mean(0) if len(found) > 1 else found[0]
+    losses: Any = output.get(key, None)
+    if losses is None:
+        raise KeyError(f"the loss returns {sorted(map(str, output.keys(True, True)))}, no {key!r}: see loss_key")
     elements = losses.shape[len(shape) :].numel()
     if losses.shape[: len(shape)] != shape:
         raise ValueError(

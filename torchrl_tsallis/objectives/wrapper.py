@@ -66,8 +66,8 @@ class RatedLoss(AskedLoss, LossModule):
 
     **Limits.** The score that tunes u takes a good sample's loss for the squared length of A normal errors. Where a
     loss varies more than that by itself, as denoising losses do over their random time steps, the tuner takes this for
-    outliers; ``docs/any_loss.md`` has measurements. A loss that can be negative, as a log-density's, is refused: rate
-    that by :class:`~torchrl_tsallis.TsallisBCLoss`.
+    outliers, and ``draws`` helps in part; ``docs/any_loss.md`` has measurements. A loss that can be negative, as a
+    log-density's, is refused: rate that by :class:`~torchrl_tsallis.TsallisBCLoss`.
 
     Source: this project.
 
@@ -80,8 +80,10 @@ class RatedLoss(AskedLoss, LossModule):
             ``PeakRating()``.
         loss_key (NestedKey): the output that is minimised. Default: None, the only one that starts with ``"loss"``.
         dims (float): A. Default: None, the number of elements that the loss has a sample, or if it has one, that the
-            action (chunk) has.
+            action (chunk) has; times ``draws``.
         rate (float): kappa, in (0, 1]. Default: 0.02.
+        draws (int): for a loss that draws random numbers: rates by the mean loss of so many more passes, without
+            gradient, so that a sample's rating is not that of its luck. Default: 0, rates by the pass with gradient.
         reduction (str): ``"mean"``, ``"sum"`` or ``"none"`` of the samples. Default: ``"mean"``.
         sync_stats (bool): take the statistics of the batch over all processes of ``torch.distributed``. Default: True.
         process_group (ProcessGroup): these processes only. Default: None, all of them.
@@ -117,6 +119,7 @@ class RatedLoss(AskedLoss, LossModule):
         loss_key: str | None = None,
         dims: float | None = None,
         rate: float = 0.02,
+        draws: int = 0,
         reduction: Literal["mean", "sum", "none"] | None = None,
         sync_stats: bool = True,
         process_group: Any = None,
@@ -142,6 +145,7 @@ class RatedLoss(AskedLoss, LossModule):
         self.rating_module.stack(None)
         self.scale = RunningScale(check_number("rate", rate, above=0, high=1))
         self.dims = None if dims is None else check_number("dims", dims, above=0)
+        self.draws = int(check_number("draws", draws, low=0, integer=True))
         self.reduction = reduction or "mean"
         self.sync_stats = sync_stats
         self.process_group = process_group
@@ -218,26 +222,31 @@ class RatedLoss(AskedLoss, LossModule):
         """What a mean over a batch with a mask ``[*B]`` means: of all processes if ``sync``."""
         return Batch.of(mask, False, sync and self.sync_stats, self.process_group)
 
-    def _rate(self, tensordict: TensorDictBase, sync: bool = True, draws: int = 1) -> tuple[Evidence, Rated]:
-        """Rates a batch by the mean of some draws of its loss."""
+    def _rate(self, tensordict: TensorDictBase, sync: bool = True, draws: int | None = None) -> tuple[Evidence, Rated]:
+        """Rates a batch, by the pass that has the gradient or by the mean of some that have none."""
         inputs = plain_inputs(tensordict, self.loss_module, self._networks_asked)
         batch = self.batch_of(mask_of(self, inputs), sync)
         inputs, far = split_far(inputs, self.in_keys, batch.mask)
-        outputs = [self.loss_module(inputs.copy()) for _ in range(draws)]
-        losses, elements = losses_of_samples(outputs, self.loss_key, inputs.shape, batch.mask)
-        dims = self.dims or (elements if elements > 1 else action_dims(self.loss_module, inputs))
-        losses = losses.masked_fill(far, torch.inf)
+
+        def draw() -> tuple[Tensor, int, TensorDictBase]:
+            written = self.loss_module(inputs.copy())
+            losses, elements = losses_of_samples(written, self.loss_key, inputs.shape, batch.mask)
+            return losses.masked_fill(far, torch.inf), elements, written
+
+        losses, elements, written = draw()
+        dims = self.dims or (elements if elements > 1 else action_dims(self.loss_module, inputs)) * max(self.draws, 1)
         with torch.no_grad():
-            known = losses.detach() if batch.mask is None else losses.detach().where(batch.mask, 0.0)
+            passes = self.draws if draws is None else draws
+            known = torch.stack([draw()[0] for _ in range(passes)]).mean(0) if passes else losses.detach()
+            known = known if batch.mask is None else known.where(batch.mask, 0.0)
             scale = self.scale(known, batch)
-            distance, typical = self.rating_module.calibrated(
-                (known * (dims / scale)).clamp(max=MAX_DISTANCE), dims, batch
-            )
+            distance = (known * (dims / scale)).clamp(max=MAX_DISTANCE)
+            distance, typical = self.rating_module.calibrated(distance, dims, batch)
             value, weight = peak_value(distance, self.rating_module.u.to(distance))
+            value = value * (2 * scale * stretch(typical) / dims)  # in the unit of the loss
             self.scale.update(known, weight, batch)
-            value = value * (2 * scale * stretch(typical) / dims)
         none: Any = None
-        evidence = Evidence(-losses, -losses, none, inputs, None, batch, outputs[0])
+        evidence = Evidence(-losses, -losses, none, inputs, None, batch, written)
         logged = {"u": self.rating_module.u.clone(), "distance": typical}
         return evidence, Rated(evidence.loss(value, weight), weight, distance, logged)
 
@@ -284,20 +293,23 @@ class RatedLoss(AskedLoss, LossModule):
         return out
 
     def rating(
-        self, tensordict: TensorDictBase, chunk_size: int | None = None, *, draws: int = 1, seed: int = 0
+        self, tensordict: TensorDictBase, chunk_size: int | None = None, *, draws: int | None = None, seed: int = 0
     ) -> Tensor:
-        """Rating of every sample, as :meth:`TsallisBCLoss.rating`; of a loss that draws random numbers, by its mean.
+        """Rating of every sample: near 0 for what the imitator takes for noise.
+
+        In evaluation mode, with the frozen statistics of training, as :meth:`TsallisBCLoss.rating`.
 
         Args:
             tensordict: samples with the keys of ``in_keys``, ``[*B]``.
             chunk_size: samples at once, along the first dimension. Default: None, all.
-            draws: over how many draws the loss is averaged; 1 for a loss that draws nothing.
-            seed: of the draws, which also depend on the chunks. The state of torch's generators is put back.
+            draws: by the mean loss of how many passes samples are rated. Default: None, as in training.
+            seed: of the loss's random numbers, which also depend on the chunks. The state of torch's generators is put
+                back.
 
         Returns:
             The rating, ``[*B]``; NaN for samples that a mask leaves out.
         """
-        check_number("draws", draws, low=1, integer=True)
+        draws = self.draws if draws is None else int(check_number("draws", draws, low=0, integer=True))
         with _seeded(seed, [p.device for p in self.parameters()]):
             return self._ask(lambda _, rated: rated.weight, tensordict, chunk_size, draws=draws)
 
