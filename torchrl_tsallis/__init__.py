@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from torchrl_tsallis.objectives import CATSoftUpdate, PredictiveBCLoss, TsallisBCLoss
+from torchrl_tsallis.objectives import CATSoftUpdate, PredictiveBCLoss, RatedLoss, TsallisBCLoss
 from torchrl_tsallis.optim import AdaTerm
 from torchrl_tsallis.ratings import PeakRating, QTuner, Rating, ScoreTuner, TsallisRating
 from torchrl_tsallis.version import __version__
@@ -13,6 +13,7 @@ __all__ = [
     "PeakRating",
     "PredictiveBCLoss",
     "QTuner",
+    "RatedLoss",
     "Rating",
     "ScoreTuner",
     "TsallisBCLoss",

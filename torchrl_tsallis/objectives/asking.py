@@ -56,7 +56,7 @@ class AskedLoss:
         actor_network_params: Any
         training: bool
 
-        def _rate(self, tensordict: TensorDictBase, sync: bool = True) -> tuple[Evidence, Rated]: ...
+        def _rate(self, tensordict: TensorDictBase, *args: Any, **options: Any) -> tuple[Evidence, Rated]: ...
 
     @property
     def q(self) -> Tensor:
@@ -115,11 +115,20 @@ class AskedLoss:
         params = self.actor_network_params.data[member].flatten_keys(".")
         return {name: value.clone() for name, value in params.items()}
 
+    @property
+    def _networks_asked(self) -> list[nn.Module]:
+        """Networks whose mode decides about the answers; TorchRL keeps them out of the loss's children."""
+        return [self.actor_network]
+
     def _ask(
-        self, question: Callable[[Evidence, Rated], Tensor], tensordict: TensorDictBase, chunk_size: int | None
+        self,
+        question: Callable[[Evidence, Rated], Tensor],
+        tensordict: TensorDictBase,
+        chunk_size: int | None,
+        **options: Any,
     ) -> Tensor:
         """An answer about every sample, ``[*B]``, in evaluation mode; NaN where the mask leaves a sample out."""
-        with evaluating(self, self.actor_network):  # type: ignore[arg-type]
+        with evaluating(self, *self._networks_asked):  # type: ignore[arg-type]
             dim = 0 if self.num_members is None else 1
             if chunk_size is None or tensordict.ndim <= dim:
                 parts: Any = [tensordict]
@@ -127,7 +136,7 @@ class AskedLoss:
                 parts = tensordict.split(int(check_number("chunk_size", chunk_size, low=1, integer=True)), dim)
             answers = []
             for part in parts:
-                evidence, rated = self._rate(part, sync=False)
+                evidence, rated = self._rate(part, sync=False, **options)
                 answers.append(evidence.batch.valid(question(evidence, rated)))
             return answers[0] if len(answers) == 1 else torch.cat(answers, dim)
 

@@ -12,11 +12,22 @@ from torch import Tensor
 from torch.distributions import Categorical, Distribution, OneHotCategorical
 
 from torchrl_tsallis.ratings.base import Evidence, Rated, Rating
+from torchrl_tsallis.ratings.batch import Batch
 from torchrl_tsallis.ratings.normal import MAX_DISTANCE, diagonal_normal, squared_distance
 from torchrl_tsallis.ratings.running import RunningMean
 
 #: Typical squared distances a dimension over this say that the scale does not fit yet; a normal's is 1.
 CALIBRATED = 2.0
+
+
+def stretch(typical: Tensor) -> Tensor:
+    """By what a squared scale is multiplied until it fits, for a typical squared distance T a dimension; at least 1.
+
+    Examples:
+        >>> stretch(torch.tensor([0.9, 2.0, 7.0]))
+        tensor([1.0000, 1.0000, 3.5000])
+    """
+    return (typical / CALIBRATED).clamp_min(1.0)
 
 
 def log_peak(dist: Distribution) -> Tensor:
@@ -127,7 +138,7 @@ class PeakRating(Rating):
         self.add_setting("u", u, 0, 1)
         self.nearness = RunningMean(start=0.5)  # T = 1: the plain formula
         #: Action dimensions A of the last batch; None where its distribution is no diagonal normal.
-        self.dims: int | None = None
+        self.dims: float | None = None
 
     def stack(self, num_members: int | None) -> None:
         """See :meth:`Rating.stack`."""
@@ -145,6 +156,22 @@ class PeakRating(Rating):
 
         return ScoreTuner
 
+    def calibrated(self, distance: Tensor, dims: float, batch: Batch) -> tuple[Tensor, Tensor]:
+        """Distances of a batch, made smaller while the scale does not fit; see above.
+
+        Args:
+            distance: Z, ``[*B]``, without gradient.
+            dims: A, of how many dimensions.
+            batch: whose samples they are.
+
+        Returns:
+            Z, ``[*B]``, and T, a scalar or ``[S]``; Z was divided by :func:`stretch` of T.
+        """
+        self.dims = dims
+        (near,) = batch.mean((distance / dims + 1).reciprocal_())
+        typical = self.nearness(near).reciprocal() - 1
+        return distance / batch.spread(stretch(typical), distance), typical
+
     def forward(self, evidence: Evidence) -> Rated:
         """See :meth:`Rating.forward`."""
         batch = evidence.batch
@@ -156,11 +183,7 @@ class PeakRating(Rating):
                 distance = (-2 * log_ratio).clamp(0, MAX_DISTANCE)
                 typical = torch.zeros_like(self.u, dtype=distance.dtype)
             else:
-                self.dims = normal.loc.shape[-1]
-                distance = squared_distance(normal)
-                (near,) = batch.mean((distance / self.dims + 1).reciprocal_())
-                typical = self.nearness(near).reciprocal() - 1
-                distance = distance / batch.spread((typical / CALIBRATED).clamp_min(1.0), distance)
+                distance, typical = self.calibrated(squared_distance(normal), normal.loc.shape[-1], batch)
             value, weight = peak_value(distance, batch.spread(self.u.to(distance), distance))
         logged = {"u": self.u.clone(), "distance": typical}
         return Rated(evidence.loss(value, weight), weight, distance, logged)

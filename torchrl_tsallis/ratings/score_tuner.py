@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from torchrl_tsallis.objectives.bc import TsallisBCLoss
 
 
-def hyvarinen_score(distance: Tensor, u: Tensor, dims: int, batch: Batch | None = None) -> Tensor:
+def hyvarinen_score(distance: Tensor, u: Tensor, dims: float, batch: Batch | None = None) -> Tensor:
     r"""Hyvarinen score of the improper model :math:`f_u(a) = \exp\{-(1 - \rho) / u\}`, weighted by the variances.
 
     .. math:: H(u) = \mathbb{E}\left[w (2 u Z - 2 A) + w^2 Z\right] / A, \qquad w = e^{-u Z / 2}
@@ -48,7 +48,7 @@ def hyvarinen_score(distance: Tensor, u: Tensor, dims: int, batch: Batch | None 
     return batch.mean((w * (2 * wide * z - 2 * dims) + w.square() * z) / dims)[0]
 
 
-def score_gradient(distance: Tensor, u: Tensor, dims: int, batch: Batch | None = None) -> tuple[Tensor, Tensor]:
+def score_gradient(distance: Tensor, u: Tensor, dims: float, batch: Batch | None = None) -> tuple[Tensor, Tensor]:
     r"""Value and derivative of :func:`hyvarinen_score` with respect to u, written out.
 
     .. math:: \frac{d H}{d u} = \mathbb{E}\left[w \{(A + 2) Z - u Z^2\} - w^2 Z^2\right] / A
