@@ -14,6 +14,8 @@ from ant_units import Key, as_csv, key_of
 from torchrl_tsallis.evaluation import bootstrap_interval, median, returns_by_level
 from torchrl_tsallis.jobs import atomic_path
 
+#: In the order of the table and the map.
+ORDER = ("bc", "q_bc_0.95", "q_bc_0.9", "q_bc_0.8", "proposal", "adaptive_gamma", "peak", "peak_fixed", "beta_only")
 LABELS = {
     "bc": "BC",
     "proposal": "proposal",
@@ -37,6 +39,11 @@ def label_of(method: str) -> str:
     return LABELS.get(method, method.replace("q_bc_", "q = "))
 
 
+def ordered(methods: Mapping[str, Any]) -> list[str]:
+    """Methods in the table's order, unknown ones last."""
+    return sorted(methods, key=lambda method: ORDER.index(method) if method in ORDER else len(ORDER))
+
+
 def scores_of(rows: Sequence[Mapping[str, Any]]) -> Scores:
     """Returns ``[S, E]`` by cell and method; of policies that are being evaluated, only complete ones."""
     episodes = 1 + max(row["episode"] for row in rows)
@@ -48,7 +55,7 @@ def scores_of(rows: Sequence[Mapping[str, Any]]) -> Scores:
             cell = nested.setdefault((key.trio, key.task, key.std, key.scale), {})
             cell.setdefault(key.method, {}).setdefault(key.seed, []).append(row["return"])
     return {
-        cell: {method: np.array([seeds[seed] for seed in sorted(seeds)]) for method, seeds in methods.items()}
+        cell: {method: np.array([methods[method][s] for s in sorted(methods[method])]) for method in ordered(methods)}
         for cell, methods in nested.items()
     }
 
@@ -75,7 +82,7 @@ def table_of(scores: Scores) -> list[dict[str, str]]:
 
 
 def claims_of(scores: Scores) -> list[dict[str, str]]:
-    """What was wanted of the tuned peak rating, cell by cell: against BC where the data is clean, else the best q-BC."""
+    """What was wanted of the tuned peak rating, cell by cell: against BC on clean data, else against the best q-BC."""
     claims = []
     for (trio, task, std, scale), methods in sorted(scores.items()):
         if "peak" not in methods:
