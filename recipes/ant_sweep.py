@@ -56,6 +56,7 @@ def train(unit: Unit, cfg: DictConfig) -> None:
     rating, tuner = make_rating(cfg, [cfg.methods[method] for method, _ in unit.members])
     loss = instantiate(cfg.loss, _partial_=True)(actor_network=actors, rating=rating).to(cfg.device)
     if cfg.compile is not None:
+        torch.compiler.reset()  # code of an earlier unit in this process guards a loss that is no more
         loss.compile(**cfg.compile)
     members = [data[seed] for seed in seeds]
     buffer = make_stacked_replay_buffer(members, seeds=seeds, batch_size=cfg.batch_size)
