@@ -74,7 +74,7 @@ def train(case: str, rank: int | None = None) -> dict[str, torch.Tensor]:
         if rank is not None:
             batch = batch[..., rank * ROWS // 2 : (rank + 1) * ROWS // 2]
         out = forward(as_sequences(batch) if kind == "prediction" else batch)
-        sum(out[name] for name in out.keys() if name.startswith("loss_")).backward()
+        sum(value for name, value in out.items() if name.startswith("loss_")).backward()
         optimizer.step()
         optimizer.zero_grad()
         if updater is not None:

@@ -158,8 +158,8 @@ class Rating(nn.Module):
             value = getattr(self, name)
             if value.ndim and len(value) != num_members:
                 raise ValueError(
-                    f"{argument} has {len(value)} values for {num_members or 1} policies: give a number or one of each, "
-                    "and each loss a rating of its own"
+                    f"{argument} has {len(value)} values for {num_members or 1} policies: give a number or one of "
+                    "each, and each loss a rating of its own"
                 )
             if num_members is not None and not value.ndim:
                 setattr(self, name, value.repeat(num_members))
