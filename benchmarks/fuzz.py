@@ -1,0 +1,212 @@
+"""Fuzz of the public constructors, of the data that they are given, and of the recipes' options.
+
+Every argument gets values of wrong types, signs and sizes, beside valid ones for the others. Counted are calls that
+
+- are raw: the error comes from outside of the package (torch, tensordict, NumPy, Python),
+- do not name the argument in their message, and
+- accept a value that the argument's kind does not allow.
+
+    python benchmarks/fuzz.py --examples 50
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import io
+import json
+import logging
+import os
+import sys
+import tempfile
+import traceback
+import warnings
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+sys.path.insert(0, str(Path(__file__).parent))
+
+import torch
+from fuzz_inputs import consumers, mutations
+from fuzz_kinds import values
+from fuzz_table import Reached, Subject, subjects
+from hypothesis import HealthCheck, Phase, given, seed, settings
+
+import torchrl_tsallis
+
+ROOT = Path(torchrl_tsallis.__file__).parent
+RECIPES = ROOT.parent / "recipes"
+#: What messages may call an argument, beside its name.
+ALSO = {
+    "demonstrations": ("demonstrations", "trajector"),
+    "data": ("demonstrations",),
+    "actor_network": ("actor",),
+    "path": ("file",),
+}
+
+
+class Fault(NamedTuple):
+    """A call that went wrong."""
+
+    subject: str
+    argument: str
+    kind: str  # raw, unnamed or accepted
+    value: str
+    message: str
+
+
+def judged(error: BaseException, names: Sequence[str]) -> str | None:
+    """What is wrong with an error; None if it is as it should be."""
+    file = Path(traceback.extract_tb(error.__traceback__)[-1].filename)
+    own = ROOT in file.parents or RECIPES in file.parents
+    if not own or not isinstance(error, (TypeError, ValueError, KeyError, OSError, NotImplementedError, SystemExit)):
+        return "raw"
+    return None if any(name in str(error) for name in names) else "unnamed"
+
+
+def shown(value: Any) -> str:
+    """A value in a few characters."""
+    try:
+        return repr(value)[:60].replace("\n", " ")
+    except Exception as error:
+        return f"{type(value).__name__} ({error})"
+
+
+@contextlib.contextmanager
+def quiet() -> Iterator[None]:
+    """A new folder to work in; no warnings, no logs, and torch's random numbers as they were."""
+    before = os.getcwd()
+    state = torch.get_rng_state()
+    with tempfile.TemporaryDirectory() as folder, warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        logging.disable(logging.CRITICAL)
+        inner = Path(folder) / "a" / "b"
+        inner.mkdir(parents=True)
+        os.chdir(inner)
+        try:
+            with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
+                yield
+        finally:
+            os.chdir(before)
+            logging.disable(logging.NOTSET)
+            torch.set_rng_state(state)
+
+
+def call(subject: Subject, arguments: dict[str, Any]) -> None:
+    """Calls; an ``__init__`` on an object that is made for it."""
+    if subject.make.__name__ == "__init__":
+        owner = sys.modules[subject.make.__module__].__dict__[subject.make.__qualname__.split(".")[0]]
+        subject.make(owner.__new__(owner), **arguments)
+    else:
+        subject.make(**arguments)
+
+
+def too_many(value: Any) -> bool:
+    """Whether a number of things to do would never end."""
+    try:
+        return not float(value) <= 4
+    except Exception:
+        return False
+
+
+def fuzz_argument(subject: Subject, argument: str, examples: int) -> tuple[int, list[Fault]]:
+    """Calls with many values of one argument; their number, and the faults."""
+    allowed, faults, count = subject.arguments()[argument], [], 0
+
+    @seed(0)
+    @settings(max_examples=examples, database=None, deadline=None, phases=[Phase.generate],
+              suppress_health_check=list(HealthCheck))  # fmt: skip
+    @given(values())
+    def one(value: Any) -> None:
+        nonlocal count
+        if argument in subject.few and too_many(value) and allowed(value):
+            return
+        count += 1
+        text = shown(value)
+        try:
+            call(subject, {**subject.valid(), argument: value})
+        except Reached:
+            pass
+        except BaseException as error:
+            kind = judged(error, (argument, *ALSO.get(argument, ())))
+            if kind:
+                faults.append(Fault(subject.name, argument, kind, text, f"{type(error).__name__}: {error}"[:150]))
+            return
+        if not allowed(value):
+            faults.append(Fault(subject.name, argument, "accepted", text, ""))
+
+    with quiet():
+        one()
+    return count, faults
+
+
+def fuzz_input(name: str, consume: Any, examples: int) -> tuple[int, list[Fault]]:
+    """Calls with data of which one entry is spoilt; their number, and the faults. Nothing is taken for accepted."""
+    faults, count = [], 0
+
+    @seed(0)
+    @settings(max_examples=examples, database=None, deadline=None, phases=[Phase.generate],
+              suppress_health_check=list(HealthCheck))  # fmt: skip
+    @given(mutations())
+    def one(spoilt: Any) -> None:
+        nonlocal count
+        count += 1
+        try:
+            consume(spoilt.data)
+        except BaseException as error:
+            kind = judged(error, spoilt.names)
+            if kind:
+                faults.append(Fault(name, "data", kind, spoilt.what, f"{type(error).__name__}: {error}"[:150]))
+
+    with quiet():
+        one()
+    return count, faults
+
+
+def everything(examples: int, chosen: str = "") -> Iterator[tuple[str, str, int, list[Fault]]]:
+    """All subjects, argument by argument, and all consumers of data."""
+    for subject in subjects():
+        if chosen in subject.name:
+            for argument in subject.arguments():
+                yield (subject.name, argument, *fuzz_argument(subject, argument, examples))
+    for name, consume in consumers().items():
+        if chosen in name:
+            yield (name, "data", *fuzz_input(name, consume, examples))
+
+
+def main() -> None:
+    """Prints the counts."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--examples", type=int, default=50, help="values of an argument")
+    parser.add_argument("--only", default="", help="part of the names of what is fuzzed")
+    parser.add_argument("--show", action="store_true", help="print one fault of each kind and argument")
+    parser.add_argument("--json", help="file for the counts by constructor")
+    options = parser.parse_args()
+    table: dict[str, Counter[str]] = {}
+    for name, argument, calls, faults in everything(options.examples, options.only):
+        row = table.setdefault(name, Counter())
+        row["arguments"] += 1
+        row["calls"] += calls
+        row["faulty"] += bool(faults)
+        row.update(fault.kind for fault in faults)
+        if options.show:
+            first = {(fault.kind, fault.message.split(":")[0]): fault for fault in reversed(faults)}
+            for fault in first.values():
+                print(f"{name}.{argument}: {fault.kind} {fault.value} {fault.message}", flush=True)
+    total: Counter[str] = Counter()
+    for row in table.values():
+        total += row
+    print(f"{'':28}{'arguments':>10}{'calls':>8}{'raw':>6}{'unnamed':>8}{'accepted':>9}{'faulty':>7}")
+    for name, row in [*table.items(), ("all", total)]:
+        print(
+            f"{name:28}{row['arguments']:10}{row['calls']:8}{row['raw']:6}{row['unnamed']:8}{row['accepted']:9}"
+            f"{row['faulty']:7}"
+        )
+    if options.json:
+        Path(options.json).write_text(json.dumps({name: dict(row) for name, row in table.items()}, indent=1))
+
+
+if __name__ == "__main__":
+    main()
