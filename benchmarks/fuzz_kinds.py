@@ -134,7 +134,14 @@ def _one(name: str, part: str) -> Allowed:
         return lambda value: isinstance(value, str) and value in {a or b for a, b in choices}
     if part.startswith("Sequence["):
         return several(kind_of(name, part[9:-1]))
-    if re.fullmatch(r"[\w.]+", part) and part not in ("Any", "ArrayLike", "Level", "Settings", "Kind", "TensorDictBase"):
+    if re.fullmatch(r"[\w.]+", part) and part not in (
+        "Any",
+        "ArrayLike",
+        "Level",
+        "Settings",
+        "Kind",
+        "TensorDictBase",
+    ):
         return named(part.split(".")[-1])
     return (lambda value: isinstance(value, (TensorDict, Mapping))) if part == "TensorDictBase" else anything
 

@@ -117,16 +117,13 @@ def _reach(*args: Any, **kwargs: Any) -> Any:
     raise Reached
 
 
-_numbers = anything  # a number or several, of which each rating has its own range
-_TSALLIS: dict[str, Allowed | None] = {
-    name: (lambda name: lambda v: number(name, 0, 1)(v) or bool(np.size(v) and several(number(name, 0, 1))(v)))(name)
-    for name in ("q", "gamma_min", "gamma_max", "beta", "u")
-}
-_RATING = {name: _TSALLIS[name] for name in ("q", "gamma_min", "gamma_max", "beta")}
+def _share(name: str) -> Allowed:
+    """A number in [0, 1], or one for each stacked member."""
+    one = number(name, 0, 1)
+    return lambda value: one(value) or bool(np.size(value) and several(one)(value))
 
 
-def _pick(*names: str) -> dict[str, Allowed | None]:
-    return {name: _TSALLIS[name] for name in names}
+_RATING: dict[str, Allowed | None] = {name: _share(name) for name in ("q", "gamma_min", "gamma_max", "beta")}
 
 
 #: An amateur without hidden layers, as its file holds it.
@@ -142,7 +139,7 @@ def _subjects() -> Iterator[tuple[str, Callable[[], Subject]]]:
 
     data = {"demonstrations": None}  # fuzzed by fuzz_inputs, where its entries are
     yield of("TsallisRating", lambda: tt.TsallisRating, kinds=_RATING)
-    yield of("PeakRating", lambda: tt.PeakRating, kinds=_pick("u", "beta"))
+    yield of("PeakRating", lambda: tt.PeakRating, kinds={"u": _share("u"), "beta": _share("beta")})
     yield of("TsallisBCLoss", lambda: tt.TsallisBCLoss, lambda: {"actor_network": _actor()}, kinds=_RATING)
     recurrent = lambda: {"actor_network": _recurrent()}  # noqa: E731
     yield of("PredictiveBCLoss", lambda: tt.PredictiveBCLoss, recurrent, kinds=_RATING)
@@ -151,18 +148,44 @@ def _subjects() -> Iterator[tuple[str, Callable[[], Subject]]]:
     tuned = {"tuned": lambda v: v is None}
     yield of("ScoreTuner", lambda: tt.ScoreTuner, lambda: {"loss": _peak_loss()}, kinds=tuned)
     yield of("CATSoftUpdate", lambda: tt.CATSoftUpdate, lambda: {"loss_module": _loss()})
-    yield of("AdaTerm", lambda: tt.AdaTerm, lambda: {"params": [nn.Parameter(torch.zeros(2, 3))]}, kinds={"betas": several(number("beta", 0, 1))})
+    yield of(
+        "AdaTerm",
+        lambda: tt.AdaTerm,
+        lambda: {"params": [nn.Parameter(torch.zeros(2, 3))]},
+        kinds={"betas": several(number("beta", 0, 1))},
+    )
     yield of("make_policy", lambda: ttm.make_policy, lambda: {"obs_dim": 3, "action_dim": 2})
-    yield of("make_recurrent_policy", lambda: ttm.make_recurrent_policy, lambda: {"obs_dim": 3, "action_dim": 2, "hidden_size": 4})
+    yield of(
+        "make_recurrent_policy",
+        lambda: ttm.make_recurrent_policy,
+        lambda: {"obs_dim": 3, "action_dim": 2, "hidden_size": 4},
+    )
     yield of("NormalHead", lambda: ttm.NormalHead)
-    yield of("NoisyLSTM", lambda: ttm.NoisyLSTM, lambda: {"input_size": 3, "hidden_size": 4}, few=frozenset({"num_layers"}))
+    yield of(
+        "NoisyLSTM", lambda: ttm.NoisyLSTM, lambda: {"input_size": 3, "hidden_size": 4}, few=frozenset({"num_layers"})
+    )
     yield of("RMSNorm", lambda: ttm.RMSNorm, lambda: {"size": 4})
-    yield of("Linear", lambda: ttm.Linear, lambda: {"in_features": 3, "out_features": 2}, kinds={"bias": flag, "dtype": kind_of("dtype", "torch.dtype | None")})
-    yield of("make_replay_buffer", lambda: ttd.make_replay_buffer, lambda: {"demonstrations": rows(), "batch_size": 4}, kinds=data)
+    yield of(
+        "Linear",
+        lambda: ttm.Linear,
+        lambda: {"in_features": 3, "out_features": 2},
+        kinds={"bias": flag, "dtype": kind_of("dtype", "torch.dtype | None")},
+    )
+    yield of(
+        "make_replay_buffer",
+        lambda: ttd.make_replay_buffer,
+        lambda: {"demonstrations": rows(), "batch_size": 4},
+        kinds=data,
+    )
     sequences = lambda: {"demonstrations": rows(), "slice_len": 4, "num_slices": 2}  # noqa: E731
     yield of("make_sequence_buffer", lambda: ttd.make_sequence_buffer, sequences, kinds=data)
     stacked = lambda: {"demonstrations": rows(), "seeds": [0, 1], "batch_size": 4}  # noqa: E731
-    yield of("make_stacked_replay_buffer", lambda: ttd.make_stacked_replay_buffer, stacked, kinds={"demonstrations": anything})
+    yield of(
+        "make_stacked_replay_buffer",
+        lambda: ttd.make_stacked_replay_buffer,
+        stacked,
+        kinds={"demonstrations": anything},
+    )
     ranges = lambda: {"seeds": [0, 1], "rows": [range(8), range(8)]}  # noqa: E731
     yield of("MemberSampler", lambda: ttd.MemberSampler.__init__, ranges, kinds={"self": None})
     centres = lambda: {name: {"action": torch.ones(2)} for name in ("centres", "scales")}  # noqa: E731
@@ -176,49 +199,146 @@ def _subjects() -> Iterator[tuple[str, Callable[[], Subject]]]:
     yield of("add_action_noise", lambda: ttd.add_action_noise, one, kinds=data)
     yield of("replace_with_amateur", lambda: ttd.replace_with_amateur, two, kinds=sides)
     yield of("make_task", lambda: ttd.make_task, lambda: {"task": "both", **two()}, kinds=sides)
-    yield of("replace_pairs", lambda: ttd.replace_pairs, lambda: {"experts": rows(), "others": rows(), "share": 0.5}, kinds=sides)
+    yield of(
+        "replace_pairs",
+        lambda: ttd.replace_pairs,
+        lambda: {"experts": rows(), "others": rows(), "share": 0.5},
+        kinds=sides,
+    )
     yield of("split_episodes", lambda: ttd.split_episodes, lambda: {**one(), "share": 0.5}, kinds=data)
     yield of("split_trajectories", lambda: ttd.split_trajectories, lambda: {**one(), "share": 0.5}, kinds=data)
     yield of("fold_episodes", lambda: ttd.fold_episodes, lambda: {**one(), "folds": 2}, kinds=data)
     yield of("validate_demonstrations", lambda: ttd.validate_demonstrations, one, kinds=data)
     yield of("inspect_demonstrations", lambda: ttd.inspect_demonstrations, one, kinds=data)
-    yield of("record_trajectory", lambda: ttd.record_trajectory, lambda: {"make_env": _Env, "policy": _numpy_policy(), "std": 0.1, "seed": 0}, few=frozenset({"tries", "length"}))
-    yield of("record_flips", lambda: ttd.record_flips, lambda: {"make_env": _reach, "seed": 0, "steps": 5}, few=frozenset({"steps"}), kinds={"style": None})
+    yield of(
+        "record_trajectory",
+        lambda: ttd.record_trajectory,
+        lambda: {"make_env": _Env, "policy": _numpy_policy(), "std": 0.1, "seed": 0},
+        few=frozenset({"tries", "length"}),
+    )
+    yield of(
+        "record_flips",
+        lambda: ttd.record_flips,
+        lambda: {"make_env": _reach, "seed": 0, "steps": 5},
+        few=frozenset({"steps"}),
+        kinds={"style": None},
+    )
     yield of("FlipOperator", lambda: ttd.FlipOperator, lambda: {"seed": 0}, kinds={"style": None})
     yield of("NumpyPolicy", lambda: ttd.NumpyPolicy, lambda: {"tensors": _tensors()}, kinds={"tensors": named_mapping})
     yield of("load_policy", lambda: ttd.load_policy, lambda: {"path": "amateur"})
     yield of("load_demonstrations", lambda: ttd.load_demonstrations, lambda: {"path": "none"})
-    yield of("save_demonstrations", lambda: ttd.save_demonstrations, lambda: {"path": "x", "demonstrations": rows(), "metadata": {}}, kinds={**data, "metadata": anything})
-    yield of("readers.Options", lambda: _module("torchrl_tsallis.data.readers").Options, kinds={"observation": _keys, "action": _keys})
-    yield of("read_demonstrations", lambda: _module("torchrl_tsallis.data.readers").read_demonstrations, lambda: {"path": "none"}, kinds={"observation": anything, "action": anything})
-    yield of("make_offline_trainer", lambda: ttt.make_offline_trainer, _trainer, kinds={"replay_buffer": named_buffer, "loss": named_loss})
+    yield of(
+        "save_demonstrations",
+        lambda: ttd.save_demonstrations,
+        lambda: {"path": "x", "demonstrations": rows(), "metadata": {}},
+        kinds={**data, "metadata": anything},
+    )
+    yield of(
+        "readers.Options",
+        lambda: _module("torchrl_tsallis.data.readers").Options,
+        kinds={"observation": _keys, "action": _keys},
+    )
+    yield of(
+        "read_demonstrations",
+        lambda: _module("torchrl_tsallis.data.readers").read_demonstrations,
+        lambda: {"path": _file()},
+        kinds={"observation": _keys, "action": _keys},
+    )
+    yield of(
+        "make_offline_trainer",
+        lambda: ttt.make_offline_trainer,
+        _trainer,
+        kinds={"replay_buffer": named_buffer, "loss": named_loss},
+    )
     yield of("EvaluationHook", lambda: ttt.EvaluationHook, lambda: {"evaluate": _reach, "every": 10})
     optimizer = lambda: torch.optim.SGD([nn.Parameter(torch.zeros(1))], lr=0.1)  # noqa: E731
     constant = lambda o: torch.optim.lr_scheduler.ConstantLR(o)  # noqa: E731
     yield of("ScheduleHook", lambda: ttt.ScheduleHook, lambda: {"make": constant, "optimizer": optimizer()})
     yield of("GuardedStepper", lambda: ttt.GuardedStepper)
     yield of("OfflineClock", lambda: ttt.OfflineClock, lambda: {"steps": 3})
-    yield of("SampleHook", lambda: ttt.SampleHook, lambda: {"replay_buffer": ttd.make_replay_buffer(rows(), batch_size=4)}, kinds={"replay_buffer": named_buffer})
-    yield of("LoggerGroup", lambda: ttt.LoggerGroup.__init__, lambda: {"loggers": [_csv()]}, kinds={"self": None, "loggers": lambda v: False})
-    yield of("make_logger", lambda: ttt.make_logger, lambda: {"kind": "csv", "folder": "logs", "name": "a"}, kinds={"kind": lambda v: v == "csv", "tags": _keys})
+    yield of(
+        "SampleHook",
+        lambda: ttt.SampleHook,
+        lambda: {"replay_buffer": ttd.make_replay_buffer(rows(), batch_size=4)},
+        kinds={"replay_buffer": named_buffer},
+    )
+    yield of(
+        "LoggerGroup",
+        lambda: ttt.LoggerGroup.__init__,
+        lambda: {"loggers": [_csv()]},
+        kinds={"self": None, "loggers": lambda v: False},
+    )
+    yield of(
+        "make_logger",
+        lambda: ttt.make_logger,
+        lambda: {"kind": "csv", "folder": "logs", "name": "a"},
+        kinds={"kind": lambda v: v == "csv", "tags": _keys},
+    )
     yield of("keep_freed_memory", lambda: ttt.keep_freed_memory)
-    yield of("evaluate_policies", lambda: tte.evaluate_policies, _evaluation, few=frozenset({"episodes", "workers"}), kinds={"policies": anything, "env_fn": _env_fn})
+    yield of(
+        "evaluate_policies",
+        lambda: tte.evaluate_policies,
+        _evaluation,
+        few=frozenset({"episodes", "workers"}),
+        kinds={"policies": anything, "env_fn": _env_fn},
+    )
     rollout = lambda: {"policy": partial(np.zeros_like), "path": "x.gif", "env_fn": _reach}  # noqa: E731
-    yield of("record_rollout", lambda: tte.record_rollout, rollout, few=frozenset({"seconds", "fps"}), kinds={"policy": callable, "env_fn": _env_fn})
+    yield of(
+        "record_rollout",
+        lambda: tte.record_rollout,
+        rollout,
+        few=frozenset({"seconds", "fps"}),
+        kinds={"policy": callable, "env_fn": _env_fn},
+    )
     yield of("ActorPolicy", lambda: tte.ActorPolicy, lambda: {"actor": _actor()}, kinds={"actor": lambda v: False})
-    yield of("MeanPolicy", lambda: tte.MeanPolicy, lambda: {"layers": [(np.ones((4, 3)), np.zeros(4), None)]}, kinds={"layers": lambda v: False})
-    yield of("RecurrentMeanPolicy", lambda: tte.RecurrentMeanPolicy, _recurrent_parts, kinds=dict.fromkeys(("layers", "head", "mean", "std"), anything))
+    yield of(
+        "MeanPolicy",
+        lambda: tte.MeanPolicy,
+        lambda: {"layers": [(np.ones((4, 3)), np.zeros(4), None)]},
+        kinds={"layers": lambda v: False},
+    )
+    yield of(
+        "RecurrentMeanPolicy",
+        lambda: tte.RecurrentMeanPolicy,
+        _recurrent_parts,
+        kinds=dict.fromkeys(("layers", "head", "mean", "std"), anything),
+    )
     scores = lambda: {"scores": [1.0, 2.0, 3.0], "resamples": 20}  # noqa: E731
-    yield of("bootstrap_interval", lambda: tte.bootstrap_interval, scores, few=frozenset({"resamples"}), kinds={"statistic": anything, "scores": _floats})
+    yield of(
+        "bootstrap_interval",
+        lambda: tte.bootstrap_interval,
+        scores,
+        few=frozenset({"resamples"}),
+        kinds={"statistic": anything, "scores": _floats},
+    )
     pair = lambda: {"x": [1.0, 2.0], "y": [0.0, 3.0], "resamples": 20}  # noqa: E731
-    yield of("improvement_interval", lambda: tte.improvement_interval, pair, few=frozenset({"resamples"}), kinds={"x": _floats, "y": _floats})
-    yield of("probability_of_improvement", lambda: tte.probability_of_improvement, lambda: {"x": [1.0, 2.0], "y": [0.0, 3.0]}, kinds={"x": _floats, "y": _floats})
+    yield of(
+        "improvement_interval",
+        lambda: tte.improvement_interval,
+        pair,
+        few=frozenset({"resamples"}),
+        kinds={"x": _floats, "y": _floats},
+    )
+    yield of(
+        "probability_of_improvement",
+        lambda: tte.probability_of_improvement,
+        lambda: {"x": [1.0, 2.0], "y": [0.0, 3.0]},
+        kinds={"x": _floats, "y": _floats},
+    )
     yield of("iqm", lambda: tte.iqm, lambda: {"values": [1.0, 2.0]}, kinds={"values": _floats})
     yield of("median", lambda: tte.median, lambda: {"values": [1.0, 2.0]}, kinds={"values": _floats})
-    yield of("auroc", lambda: tte.auroc, lambda: {"positive": [1.0, 2.0], "negative": [0.0]}, kinds={"positive": _floats, "negative": _floats})
-    yield of("count_flips", lambda: _module("torchrl_tsallis.envs").count_flips, lambda: {"angles": np.zeros((20, 3))}, kinds={"angles": anything})
-    yield of("run_jobs", lambda: _module("torchrl_tsallis.jobs").run_jobs, lambda: {"function": _reach, "jobs": [1], "workers": 0, "total": 1, "desc": "a", "unit": "b", "progress": False}, few=frozenset({"workers"}), kinds={"jobs": anything})
-    yield of("robust_rate", lambda: _module("torchrl_tsallis.optim.student_t").robust_rate, lambda: {"distance": torch.ones(2), "nu": torch.ones(2), "rate_nu": 0.1, "k": 1.0, "eps": 1e-5})
+    yield of(
+        "auroc",
+        lambda: tte.auroc,
+        lambda: {"positive": [1.0, 2.0], "negative": [0.0]},
+        kinds={"positive": _floats, "negative": _floats},
+    )
+    yield of(
+        "count_flips",
+        lambda: _module("torchrl_tsallis.envs").count_flips,
+        lambda: {"angles": np.zeros((20, 3))},
+        kinds={"angles": anything},
+    )
 
 
 def _module(name: str) -> Any:
@@ -257,6 +377,12 @@ def _keys(value: Any) -> bool:
 
 def _env_fn(value: Any) -> bool:
     return callable(value) or isinstance(value, str)
+
+
+def _file() -> str:
+    ends = np.array([False, False, True, True])
+    np.savez("demonstrations.npz", observations=np.zeros((4, 3)), actions=np.zeros((4, 2)), terminals=ends)
+    return "demonstrations.npz"
 
 
 def _csv() -> Any:

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import math
 import numbers
+import sys
 from typing import Any
+
+from torchrl_tsallis._checks import shown
 
 
 def whole_number(name: str, value: Any, least: int) -> int:
@@ -27,8 +30,8 @@ def whole_number(name: str, value: Any, least: int) -> int:
         ...
         ValueError: episodes must be a whole number of at least 1, got episodes=2.5
     """
-    if isinstance(value, bool) or not isinstance(value, numbers.Integral) or value < least:
-        raise ValueError(f"{name} must be a whole number of at least {least}, got {name}={value!r}")
+    if isinstance(value, bool) or not isinstance(value, numbers.Integral) or not least <= int(value) < 2**63:
+        raise ValueError(f"{name} must be a whole number of at least {least}, got {name}={shown(value)}")
     return int(value)
 
 
@@ -52,6 +55,6 @@ def positive_number(name: str, value: Any) -> float:
         ValueError: fps must be a positive number, got fps=nan
     """
     good = isinstance(value, numbers.Real) and not isinstance(value, bool)
-    if not good or not math.isfinite(value) or value <= 0:
-        raise ValueError(f"{name} must be a positive number, got {name}={value!r}")
+    if not good or not 0 < value < math.inf or value > sys.float_info.max:
+        raise ValueError(f"{name} must be a positive number, got {name}={shown(value)}")
     return float(value)

@@ -11,7 +11,7 @@ from torchrl._utils import logger
 from torchrl.objectives.common import LossModule
 from torchrl.objectives.utils import TargetNetUpdater
 
-from torchrl_tsallis._checks import check_number
+from torchrl_tsallis._checks import check_choice, check_number
 from torchrl_tsallis.objectives.cat_group import CATGroup
 from torchrl_tsallis.objectives.replaced import LoadWatch
 
@@ -86,8 +86,7 @@ class CATSoftUpdate(TargetNetUpdater):
         strength = check_number("strength", strength, low=0, high=1)
         eps = check_number("eps", eps, above=0)
         k = check_number("k", k, above=0, finite=False)  # inf switches the robustness off
-        if init_scale not in ("first", "eps"):
-            raise ValueError(f"init_scale must be 'first' or 'eps', got {init_scale!r}")
+        check_choice("init_scale", init_scale, ("first", "eps"))
         self.tau, self.strength, self.eps, self.k, self.init_scale = tau, strength, eps, k, init_scale
         self._groups: dict[str, CATGroup] = {}
         self._before: dict[str, dict[str, Any]] | None = None  # what was there before a load, until the next step

@@ -13,7 +13,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor, nn
 from torchrl.objectives.common import LossModule
 
-from torchrl_tsallis._checks import check_number
+from torchrl_tsallis._checks import check_choice, check_flag, check_number, shown
 from torchrl_tsallis.objectives.asking import AskedLoss
 from torchrl_tsallis.objectives.inputs import check_key, mask_of
 from torchrl_tsallis.objectives.samples import action_dims, losses_of_samples, plain_inputs, split_far
@@ -137,9 +137,9 @@ class RatedLoss(AskedLoss, LossModule):
                 f"{kind}(..., reduction='none')"
             )
         if not isinstance(rating, PeakRating | None):
-            raise TypeError(f"RatedLoss takes a PeakRating, got {rating!r}")
-        if reduction not in (None, "mean", "sum", "none"):
-            raise ValueError(f"reduction must be 'mean', 'sum' or 'none', got {reduction!r}")
+            raise TypeError(f"rating must be a PeakRating, got {shown(rating)}")
+        if reduction is not None:
+            check_choice("reduction", reduction, ("mean", "sum", "none"))
         self.loss_module = loss_module
         self.rating_module = PeakRating() if rating is None else rating
         self.rating_module.stack(None)
@@ -147,9 +147,9 @@ class RatedLoss(AskedLoss, LossModule):
         self.dims = None if dims is None else check_number("dims", dims, above=0)
         self.draws = int(check_number("draws", draws, low=0, integer=True))
         self.reduction = reduction or "mean"
-        self.sync_stats = sync_stats
+        self.sync_stats = check_flag("sync_stats", sync_stats)
         self.process_group = process_group
-        self.loss_key = self._only_loss() if loss_key is None else loss_key
+        self.loss_key = self._only_loss() if loss_key is None else self._checked_loss(loss_key)
         others = [self._name(key) for key in loss_module.out_keys if key != self.loss_key]
         self.out_keys = [self.loss_key, *self.rating_module.logged, *_STATISTICS, *others]
 
@@ -161,6 +161,15 @@ class RatedLoss(AskedLoss, LossModule):
                 "loss_key= which of them is minimised"
             )
         return losses[0]
+
+    def _checked_loss(self, key: NestedKey) -> NestedKey:
+        check_key("loss_key", key)
+        if key not in self.loss_module.out_keys:
+            raise ValueError(
+                f"loss_key must be one of what {type(self.loss_module).__name__} returns, "
+                f"{list(self.loss_module.out_keys)}, got {key!r}"
+            )
+        return key
 
     @staticmethod
     def _name(key: NestedKey) -> NestedKey:

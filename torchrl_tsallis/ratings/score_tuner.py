@@ -136,8 +136,10 @@ class ScoreTuner(RatingTuner):
         optimizer: MakeOptimizer | None = None,
     ) -> None:
         self.u_max = check_number("u_max", u_max, above=0, below=1)
-        check_number("lr", lr, low=0)
-        super().__init__(loss, tuned=tuned, optimizer=optimizer or (lambda params: torch.optim.Adam(params, lr=lr)))
+        lr = check_number("lr", lr, low=0)
+        if optimizer is None:
+            optimizer = lambda params: torch.optim.Adam(params, lr=lr)  # noqa: E731
+        super().__init__(loss, tuned=tuned, optimizer=optimizer)
 
     def start(self) -> Tensor:
         """See :meth:`RatingTuner.start`: the phi of the rating's own u."""
