@@ -24,7 +24,8 @@ INFINITE = {"k", "ini_dof"}
 
 def plain(value: Any) -> Any:
     """A number of NumPy or torch as Python's."""
-    return value.item() if isinstance(value, (Tensor, np.ndarray, np.generic)) and np.size(value) == 1 else value
+    one = isinstance(value, (Tensor, np.ndarray, np.generic)) and math.prod(value.shape) == 1
+    return value.item() if one else value
 
 
 def number(name: str, low: float = 0, high: float = math.inf) -> Allowed:

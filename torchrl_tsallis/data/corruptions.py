@@ -14,6 +14,8 @@ from torch import Tensor
 from torchrl_tsallis._checks import check_number, check_seed, shown
 from torchrl_tsallis.data.schema import check_rows, leaves
 
+#: The most that a float32 action may be moved by.
+LARGEST = 1e30
 #: Task -> (artificial noise, amateur), section V-A.
 TASKS = {
     "clean": (False, False),
@@ -67,7 +69,8 @@ def add_action_noise(
         True
     """
     probability = check_number("probability", probability, low=0, high=1)
-    mean, scale = check_number("mean", mean), check_number("scale", scale, low=0)
+    mean = check_number("mean", mean, low=-LARGEST, high=LARGEST)
+    scale = check_number("scale", scale, low=0, high=LARGEST)
     generator = torch.Generator().manual_seed(check_seed("seed", seed))
     action = _rows_with(demonstrations, "demonstrations", "action")
     if not action.is_floating_point() or action.ndim < 2:
@@ -180,7 +183,8 @@ def make_task(
     if not isinstance(task, str) or task not in TASKS:
         raise ValueError(f"no task {shown(task)}: choose one of {', '.join(TASKS)}")
     probability = check_number("probability", probability, low=0, high=1)
-    mean, scale, seed = check_number("mean", mean), check_number("scale", scale, low=0), check_seed("seed", seed)
+    mean = check_number("mean", mean, low=-LARGEST, high=LARGEST)
+    scale, seed = check_number("scale", scale, low=0, high=LARGEST), check_seed("seed", seed)
     artificial, with_amateur = TASKS[task]
     out = replace_with_amateur(experts, amateur, seed=seed) if with_amateur else experts.clone()
     if artificial:

@@ -15,7 +15,7 @@ from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor
 
-from torchrl_tsallis._checks import shown
+from torchrl_tsallis._checks import check_number, shown
 from torchrl_tsallis.data.episodes import find_episodes, has_episodes
 from torchrl_tsallis.data.findings import Finding, named, text, vectors
 from torchrl_tsallis.data.hygiene_steps import find_boundaries, find_copies, find_lengths, find_still, find_time_jumps
@@ -137,7 +137,9 @@ def _check_tensor(name: str, value: Any, size: int | None) -> None:
     if not number and not tensor:
         wanted = "a number or a tensor [A]" if size is None else "a tensor [N]"
         raise TypeError(f"{name} must be {wanted}, got {shown(value)}")
-    if bool(torch.as_tensor(value).isnan().any()) or (tensor and size is not None and value.numel() != size):
+    if number:
+        check_number(name, value)
+    elif bool(value.isnan().any()) or (tensor and size is not None and value.numel() != size):
         raise ValueError(f"{name} must have a number for each{' row' if size else ''}, none NaN, got {shown(value)}")
 
 

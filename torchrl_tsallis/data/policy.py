@@ -73,7 +73,7 @@ def as_weights(name: str, value: Any) -> np.ndarray:
     value = value.detach().cpu().float().numpy() if hasattr(value, "detach") else value
     try:
         array = np.array(value, dtype=np.float32)
-    except (TypeError, ValueError) as error:
+    except Exception as error:  # whatever an object that is no array raises
         raise ValueError(f"{name} must be an array of numbers, got a {type(value).__name__}") from error
     if not np.isfinite(array).all():
         raise ValueError(f"{name} is not finite: the training has diverged, or the file is damaged")

@@ -110,6 +110,7 @@ def bootstrap_interval(
     tasks, n, _ = array.shape
     rng = np.random.default_rng(seed)
     rows = np.arange(tasks)[:, None]
+    check_number("statistic(scores)", statistic(array), finite=False)
     draws = [statistic(array[rows, rng.integers(n, size=(tasks, n))]) for _ in range(resamples)]
     low, high = np.quantile(draws, [(1 - confidence) / 2, (1 + confidence) / 2])
     return {"value": float(statistic(array)), "low": float(low), "high": float(high), "unit": unit, "n": n}

@@ -44,7 +44,7 @@ def memory_for(**dims: Any) -> Iterator[None]:
     """
     try:
         yield
-    except (RuntimeError, TypeError, OverflowError, MemoryError) as error:
+    except (RuntimeError, TypeError, ValueError, OverflowError, MemoryError) as error:
         text = str(error).lower()
         if not any(word in text for word in ("memory", "overflow", "unpack", "storage size", "too large", "too big")):
             raise

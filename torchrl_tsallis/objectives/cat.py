@@ -17,6 +17,9 @@ from torchrl_tsallis.objectives.replaced import LoadWatch
 
 __all__ = ["CATSoftUpdate"]
 
+#: What float32 still holds, and its square too.
+LARGEST = 1e19
+
 
 class CATSoftUpdate(TargetNetUpdater):
     r"""Consolidated adaptive T-soft update of the target parameters.
@@ -84,8 +87,10 @@ class CATSoftUpdate(TargetNetUpdater):
             raise TypeError(f"loss_module must be a loss, as TsallisBCLoss, got {type(loss_module).__name__}")
         tau = check_number("tau", tau, low=0, high=1)
         strength = check_number("strength", strength, low=0, high=1)
-        eps = check_number("eps", eps, above=0)
+        eps = check_number("eps", eps, above=0, high=LARGEST)
         k = check_number("k", k, above=0, finite=False)  # inf switches the robustness off
+        if LARGEST < k < float("inf"):
+            raise ValueError(f"k must be at most {LARGEST:g}, or inf, got {k!r}")
         check_choice("init_scale", init_scale, ("first", "eps"))
         self.tau, self.strength, self.eps, self.k, self.init_scale = tau, strength, eps, k, init_scale
         self._groups: dict[str, CATGroup] = {}

@@ -225,6 +225,11 @@ class Rating(nn.Module):
         raise NotImplementedError
 
 
+def _within(x: Any, low: float, high: float) -> bool:
+    """Whether a number is in [low, high]; integers beyond the floats are compared as they are."""
+    return low <= x <= high
+
+
 def as_numbers(name: str, value: Any, low: float, high: float) -> float | list[float]:
     """A setting as a number in [low, high], or a list of them.
 
@@ -251,7 +256,7 @@ def as_numbers(name: str, value: Any, low: float, high: float) -> float | list[f
     plain: Any = value.tolist() if isinstance(value, (Tensor, np.ndarray)) else value
     many = isinstance(plain, Sequence) and not isinstance(plain, str)
     numbers: list[Any] = list(plain) if many else [plain]
-    valid = [isinstance(x, Real) and not isinstance(x, bool) and low <= float(x) <= high for x in numbers]
+    valid = [isinstance(x, Real) and not isinstance(x, bool) and _within(x, low, high) for x in numbers]
     if numbers and all(valid):
         return [float(x) for x in numbers] if many else float(plain)
     raise ValueError(

@@ -147,7 +147,7 @@ class ScoreTuner(RatingTuner):
         inside = (share > 0) & (share < 1)
         if not bool((inside if self.tuned is None else inside | ~self.tuned).all()):
             raise ValueError(
-                f"a tuned u must start in (0, {self.u_max:g}), the bounds of ScoreTuner, got {self.rating.u}"
+                f"a tuned u must start in (0, {self.u_max:g}), the bound u_max of ScoreTuner, got {self.rating.u}"
             )
         return share.where(inside, 0.5).logit()
 
