@@ -5,21 +5,17 @@ from __future__ import annotations
 import json
 import math
 import os
-import shutil
-import tempfile
-from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal
 
 from torchrl_tsallis.data.curators import CURATORS, Plan
 from torchrl_tsallis.data.curators.choice import decide
+from torchrl_tsallis.data.curators.place import RECORD, check_place, leftovers, record_of, staged
 from torchrl_tsallis.data.ratings_folder import RatingsFolder
 from torchrl_tsallis.data.readers import Options, Reader, open_reader
-from torchrl_tsallis.jobs.files import atomic_path, disk_errors
-
-_RECORD = "curation.json"
+from torchrl_tsallis.jobs.files import atomic_path
 
 
 @dataclass(frozen=True)
@@ -134,17 +130,19 @@ def curate(
         raise ValueError(
             f"remove is for robomimic's filter keys, {reader.name} data always lose the episodes: leave it out"
         )
-    _check_target(target, source, rated.path, curator.suffixes, overwrite)
+    check_place(target, source, rated.path, curator.suffixes, overwrite)
     if not rated.usable and keep_list is None:
         plan.notes.append("the rating says of itself that it is not usable")
+    for left in leftovers(target):
+        plan.notes.append(f"{str(left)!r} is of a copy that was not finished: remove it, unless that still runs")
     if not dry_run:
-        with _staged(target, bool(curator.suffixes)) as stage:
+        with staged(target) as stage:
             curator.write(stage)
             done = _summary(plan, curator.commands(target), target, reader.name, drop, rule, why_dropped, True)
             if stage.is_dir():
-                (stage / _RECORD).write_text(json.dumps(done.to_json(), indent=1))
+                (stage / RECORD).write_text(json.dumps(done.to_json(), indent=1))
         if target.is_file():
-            with atomic_path(_record(target)) as file:
+            with atomic_path(record_of(target)) as file:
                 file.write_text(json.dumps(done.to_json(), indent=1))
         return done
     return _summary(plan, curator.commands(target), target, reader.name, drop, rule, why_dropped, False)
@@ -230,40 +228,3 @@ def _open_source(rated: RatingsFolder) -> Reader:
     if order != list(rated.names) or (unrated and form not in ("robomimic", "lerobot")):
         raise ValueError(f"the episodes of {str(path)!r} are not those that were rated: rate the data again")
     return reader
-
-
-def _record(target: Path) -> Path:
-    """Where a copy says how it was made: in its folder, or beside its file."""
-    return target / _RECORD if target.is_dir() else target.with_name(f"{target.name}.{_RECORD}")
-
-
-def _check_target(target: Path, source: Path, folder: Path, suffixes: Sequence[str], overwrite: bool) -> None:
-    if suffixes and target.suffix.lower() not in suffixes:
-        raise ValueError(f"{str(target)!r} must end with {' or '.join(suffixes)}, as the source does")
-    place = target.resolve()
-    for other, what in ((source, "the data"), (folder, "the rating")):
-        there = other.resolve()
-        if place == there or there in place.parents or place in there.parents:
-            raise ValueError(f"{str(target)!r} and {what}, {str(other)!r}, lie in each other: choose another place")
-    if target.exists() or target.is_symlink():
-        if not overwrite:
-            raise FileExistsError(
-                f"there is something at {str(target)!r}: choose another place, or overwrite it by overwrite=True"
-            )
-        if not _record(target).is_file():
-            raise FileExistsError(f"{str(target)!r} is no curated copy, and is not overwritten: remove it yourself")
-
-
-@contextmanager
-def _staged(target: Path, file: bool) -> Iterator[Path]:
-    """Yields a place beside the target, and moves what is there to the target once it is complete."""
-    with disk_errors(target):
-        target.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(prefix=f".{target.stem}-", dir=target.parent) as scratch:
-            stage = Path(scratch) / target.name
-            yield stage
-            if file or not target.is_dir():
-                os.replace(stage, target)
-            else:
-                shutil.move(target, Path(scratch) / "replaced")
-                os.replace(stage, target)

@@ -11,8 +11,10 @@ from torchrl.data import LazyMemmapStorage, TensorDictReplayBuffer
 
 from torchrl_tsallis.data.curators.base import Curator, Plan, register
 from torchrl_tsallis.data.curators.gaps import bounds
+from torchrl_tsallis.data.curators.place import check_room
 from torchrl_tsallis.data.demonstrations import load_demonstrations, save_demonstrations
 from torchrl_tsallis.data.readers.ted import load_rows
+from torchrl_tsallis.data.rows import row_bytes
 
 _ROWS = 65536  # copied at once
 
@@ -39,6 +41,8 @@ class TedCurator(Curator):
                 data.set("episode", torch.arange(count).repeat_interleave(length))
             self.plan.notes.append("the copy is flat, [N], with the number of its episode in every row")
         rows = torch.from_numpy(self.plan.keep_rows.nonzero()[0])
+        if source.is_dir():
+            check_room(target, len(rows) * (row_bytes(data) + 8))
         if source.is_file():
             _, metadata = load_demonstrations(source)
             save_demonstrations(target, self._take(data, rows), metadata)
