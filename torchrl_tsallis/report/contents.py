@@ -169,10 +169,7 @@ def facts(rated: RatingsFolder) -> list[tuple[str, str]]:
     pairs: list[tuple[str, Any]] = [
         ("Data", data.get("path") or "in memory"),
         ("Format", data.get("format")),
-        *(
-            (f"Keys of the {role}", ", ".join(map(str, _list(names))))
-            for role, names in _object(data.get("keys")).items()
-        ),
+        *((f"Keys of the {role}", ", ".join(map(str, _list(names)))) for role, names in keys.items()),
         ("Episodes and steps", f"{len(rated.names)} and {len(rated.steps['row'])}"),
         ("Identity (SHA-256)", data.get("identity")),
         ("Rating", ", ".join(f"{key} {_said(value)}" for key, value in method.items())),

@@ -21,7 +21,7 @@ _OF_PAGE = {
 }
 
 #: Settings of matplotlib under which figures are made and saved.
-STYLE: dict[str, Any] = {
+STYLE: Any = {
     "svg.fonttype": "none",
     "font.size": 9,
     "text.color": INK,
