@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from torchrl_tsallis.data.ratings_folder import RatingsFolder
-from torchrl_tsallis.report.figures import MARKED
+from torchrl_tsallis.report.figures import MARKED, MOST
 from torchrl_tsallis.report.signals import RETURN, SIGNALS, Signal, most_extreme, spearman
 
 #: Episodes in the table and in the picture of the intervals, and episodes of which the course is drawn.
@@ -89,7 +89,7 @@ def queue(rated: RatingsFolder) -> list[dict[str, Any]]:
         steps = by_episode[k]
         worst = int(np.argmax(np.nan_to_num(steps, nan=-1.0)))
         long, over = stretch(steps), float(np.mean(steps >= MARKED))
-        between = f"{number(low[k])} to {number(high[k])}" if math.isfinite(low[k]) else "–"
+        between = f"{number(low[k])} to {number(min(high[k], MOST))}" if math.isfinite(low[k]) else "–"
         rows.append(
             {
                 "place": k,
@@ -125,7 +125,7 @@ def beside(rated: RatingsFolder) -> list[dict[str, Any]]:
     for signal in shown(rated):
         values = column(rated, signal.key)
         first = [rated.names[k] for k in most_extreme(values, signal.extreme)]
-        out.append({"signal": signal, "rho": number(spearman(values, surprise), 2), "first": first})
+        out.append({"signal": signal, "rho": number(spearman(values, surprise), 2).replace("-", "−"), "first": first})
     return out
 
 
@@ -154,7 +154,7 @@ def commands(rated: RatingsFolder, folder: str) -> list[tuple[str, str]]:
                 f"tsallis curate {place} --out {out} --share {share:g} --dry-run",
             )
         )
-        found.append(("the same, written", f"tsallis curate {place} --out {out} --share {share:g}"))
+        found.append(("drop them: write a copy without them", f"tsallis curate {place} --out {out} --share {share:g}"))
     listed = "keep the episodes that you listed in keep.json, after you looked"
     found.append((listed, f"tsallis curate {place} --out {out} --list keep.json"))
     found.append(("train a policy on the copy", f"tsallis train {out} --out policy"))

@@ -141,6 +141,6 @@ def draw_signal(axes: Any, values: np.ndarray, surprise: np.ndarray, marked: np.
         marked: whether an episode stands out, ``[E]``.
         unit: of the signal.
     """
-    for chosen, colour in ((~marked, BLUE), (marked, ORANGE)):
-        axes.plot(values[chosen], surprise[chosen], "o", color=colour, markersize=3.5, alpha=0.7)
+    for chosen, colour, alpha in ((~marked, BLUE, 0.7), (marked, ORANGE, 1.0)):
+        axes.plot(values[chosen], surprise[chosen], "o", color=colour, markersize=3.5, alpha=alpha)
     axes.set(xlabel=unit, ylabel="decades a step", ylim=(0, None))

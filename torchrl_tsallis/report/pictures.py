@@ -64,32 +64,32 @@ def panels(rated: RatingsFolder, calibration: Mapping[int, float]) -> dict[str, 
                     figures.draw_agreement, mean=mean[listed], low=low[listed], high=high[listed], marked=marked[listed]
                 ),
                 f"Surprise of {len(listed)} episodes with 95 % intervals, in falling order",
-                4.6,
-                2.6,
+                3.9,
+                2.5,
             )
         ],
         "calibration": [
             Panel(
                 partial(figures.draw_calibration, shares=calibration),
                 "Share of held-out steps with 1, 2 and 3 decades or more, beside the expected 10, 1 and 0.1 %",
-                4.6,
-                2.6,
+                3.9,
+                2.5,
             )
         ],
         "histogram": [
             Panel(
                 partial(figures.draw_histogram, surprise=surprise, seen=seen),
                 "Number of steps by surprise, of policies that did not and that did see the episode, and as expected",
-                4.6,
-                2.6,
+                3.9,
+                2.5,
             )
         ],
         "worst": [
             Panel(
                 partial(figures.draw_course, surprise=by_episode[k], seen=seen_by_episode[k]),
                 f"Surprise step by step of the episode of rank {rank}",
-                4.4,
-                1.7,
+                3.9,
+                1.6,
                 f"rank {rank}: episode {k} of the data",
             )
             for rank, k in enumerate(order[: contents.DRAWN].tolist(), 1)
@@ -104,7 +104,7 @@ def panels(rated: RatingsFolder, calibration: Mapping[int, float]) -> dict[str, 
                     unit=signal.unit,
                 ),
                 f"{signal.title} of each episode beside its surprise",
-                3.2,
+                3.3,
                 2.2,
                 signal.title,
             )
@@ -118,7 +118,7 @@ def panels(rated: RatingsFolder, calibration: Mapping[int, float]) -> dict[str, 
 
 def as_file(several: list[Panel]) -> Any:
     """Pictures as one figure in light colours, at most three in a row."""
-    columns = min(len(several), 3 if several[0].width < 4 else 2)
+    columns = min(len(several), 3 if several[0].width < 3.5 else 2)
     rows = -(-len(several) // columns)
     figure, cells = figures.new_figure(
         several[0].width * columns, (several[0].height + 0.2) * rows, columns=columns, rows=rows
