@@ -5,8 +5,10 @@ from __future__ import annotations
 import os
 from typing import Any
 
+import numpy as np
+
 from torchrl_tsallis.data.ratings_folder import RatingsFolder
-from torchrl_tsallis.report.contents import LISTED, queue
+from torchrl_tsallis.report.contents import queue
 
 
 def log_ratings(folder: str | os.PathLike[str], logger: Any, *, name: str = "ratings") -> None:
@@ -30,8 +32,10 @@ def log_ratings(folder: str | os.PathLike[str], logger: Any, *, name: str = "rat
     columns = ["rank", "episode", "surprise", "interval", "steps over 3 decades", "worst step"]
     rows = [
         [row["rank"], row["name"], *(row[key][0] for key in ("surprise", "interval", "share", "worst"))]
-        for row in queue(rated)[:LISTED]
+        for row in queue(rated)
     ]
     adapter.table(f"{name}/episodes", columns, rows)
     surprise = rated.steps["surprise"]
-    adapter.histogram(f"{name}/surprise", surprise[surprise == surprise], None)
+    there = surprise[~np.isnan(surprise)]
+    if len(there):
+        adapter.histogram(f"{name}/surprise", there, None)
