@@ -15,7 +15,19 @@ from torchrl_tsallis.evaluation import bootstrap_interval, median, returns_by_le
 from torchrl_tsallis.jobs import atomic_path
 
 #: In the order of the table and the map.
-ORDER = ("bc", "q_bc_0.95", "q_bc_0.9", "q_bc_0.8", "proposal", "adaptive_gamma", "peak", "peak_fixed", "beta_only")
+ORDER = (
+    "bc",
+    "q_bc_0.95",
+    "q_bc_0.9",
+    "q_bc_0.8",
+    "q_bc_0.7",
+    "q_bc_0.6",
+    "proposal",
+    "adaptive_gamma",
+    "peak",
+    "peak_fixed",
+    "beta_only",
+)
 LABELS = {
     "bc": "BC",
     "proposal": "proposal",
