@@ -3,8 +3,8 @@
 A smooth nonlinear function of three numbers, with normal noise of 0.1, of which a share of the samples is replaced by
 uniform noise in [-3, 3]; the function itself is in [-1, 1]. For each of TorchRL's BCLoss (squared error),
 DiffusionBCLoss and ACTLoss: the root mean square error of the deterministic policy against the noiseless function on
-new inputs, and how well ratings tell the outliers (AUROC). The method ``plain`` is the wrapped loss, ``rated`` the same in
-RatedLoss with its tuner, ``rated_4`` with four more passes to rate by. Of plain training, the AUROC is that of the
+new inputs, and how well ratings tell the outliers (AUROC). The method ``plain`` is the wrapped loss, ``rated`` the same
+in RatedLoss with its tuner, ``rated_4`` with four more passes to rate by. Of plain training, the AUROC is that of the
 samples' losses. The raw numbers go to a CSV file, one row a training, and the table beside it::
 
     python benchmarks/rated_losses.py --out docs/results/rated_losses.csv
@@ -171,7 +171,7 @@ def cell_of(row: dict[str, str]) -> tuple[str, str, str]:
 def table(rows: list[dict[str, str]]) -> str:
     """Rows of trainings as a Markdown table, one line a loss, share of outliers and method."""
     lines = [
-        "| loss | outliers | method | test RMSE | relative to plain | AUROC | u | rating of clean samples | of outliers |",
+        "| loss | outliers | method | test RMSE | relative to plain | AUROC | u | rating, clean | rating, outliers |",
         "|---|---|---|---|---|---|---|---|---|",
     ]
     cells = dict.fromkeys(map(cell_of, rows))

@@ -10,7 +10,7 @@ from typing import Any
 
 import torch
 from ant_common import TRAINING, demonstrations, task_data
-from ant_units import Key, ReturnsTable, Unit, alone_in, key_of, plan
+from ant_units import Key, ReturnsTable, Unit, alone_in, key_of, parse, plan
 from common import keep_settings, make_rating, make_trainer
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
@@ -56,6 +56,7 @@ def train(unit: Unit, cfg: DictConfig) -> None:
     rating, tuner = make_rating(cfg, [cfg.methods[method] for method, _ in unit.members])
     loss = instantiate(cfg.loss, _partial_=True)(actor_network=actors, rating=rating).to(cfg.device)
     if cfg.compile is not None:
+        torch.compiler.reset()  # code of an earlier unit in this process guards a loss that is no more
         loss.compile(**cfg.compile)
     members = [data[seed] for seed in seeds]
     buffer = make_stacked_replay_buffer(members, seeds=seeds, batch_size=cfg.batch_size)
@@ -156,6 +157,9 @@ def run(cfg: DictConfig, wanted: Sequence[Key]) -> list[dict[str, Any]]:
             file = output / key.trio / f"std_{key.std:g}" / "settings.json"
             keep_settings(file, settings, (*TRAINING, "evaluation.seed"))
             demonstrations(one, cfg.progress)
+        if cfg.known is not None:  # what was done elsewhere is not done again
+            counts, rows = table_of(cfg).counts(), parse(Path(cfg.known).read_text())
+            table_of(cfg).append([row for row in rows if row["episode"] >= counts[key_of(row)]])
         try:
             kind_of = {name: str(method.rating) for name, method in cfg.methods.items()}
             launch(plan(wanted, table_of(cfg), output, cfg.evaluation.episodes, cfg.block, kind_of.__getitem__), cfg)

@@ -66,7 +66,17 @@ def test_a_place_that_cannot_be_written_is_named(name, tmp_path):
     assert sorted(part.name for part in tmp_path.iterdir()) == ["file", f"folder.{suffix}"]
 
 
-ROW = {"method": "bc", "task": "both", "std": 0.2, "seed": 0, "episode": 0, "return": 1.5, "trial": 0}
+ROW = {
+    "method": "bc",
+    "trio": "own",
+    "task": "both",
+    "std": 0.2,
+    "scale": 1.0,
+    "seed": 0,
+    "episode": 0,
+    "return": 1.5,
+    "trial": 0,
+}
 FLIPS = dict.fromkeys(("flips", "events", "singles", "multiples", "run", "success"), 1)
 ROWS = [{**ROW, "episode": i} for i in range(2000)]
 

@@ -18,7 +18,7 @@ for package in ("hydra", "pybullet", "matplotlib", "tqdm"):
 
 RECIPE = Path(__file__).parents[2] / "recipes" / "ant_noise.py"
 SMALL = ["data.length=60", "epochs=80", "checkpoint_every=8", "batch_size=256", "evaluation.episodes=2"]
-METHODS = ("bc", "q_bc", "proposal")
+METHODS = ("bc", "q_bc", "proposal", "peak")
 
 
 def start(folder: Path, *overrides: str) -> subprocess.Popen:
@@ -99,9 +99,9 @@ def test_an_interrupted_job_goes_on_to_the_same_weights(unbroken, tmp_path, sign
 
 
 def test_resuming_with_other_settings_is_refused(unbroken):
-    process = start(unbroken[0], "resume=true", "loss.gamma_min=0.2", "evaluation.episodes=3")
+    process = start(unbroken[0], "resume=true", "ratings.tsallis.gamma_min=0.2", "evaluation.episodes=3")
     _, err = process.communicate(timeout=60)
-    assert process.returncode == 1 and "was made with other loss, evaluation" in err
+    assert process.returncode == 1 and "was made with other ratings, evaluation" in err
 
 
 @pytest.mark.parametrize(

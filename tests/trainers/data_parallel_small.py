@@ -10,11 +10,20 @@ from tensordict import TensorDict
 from torch import distributed
 from torch.nn.parallel import DistributedDataParallel
 
-from torchrl_tsallis import AdaTerm, CATSoftUpdate, QTuner, TsallisBCLoss
-from torchrl_tsallis.modules import make_policy
+from torchrl_tsallis import AdaTerm, CATSoftUpdate, PeakRating, PredictiveBCLoss, QTuner, ScoreTuner, TsallisBCLoss
+from torchrl_tsallis.modules import make_policy, make_recurrent_policy
 
-#: Name -> members (0 is a single policy), whether there is a mask
-CASES = {"single": (0, False), "masked": (0, True), "members": (3, False), "masked members": (3, True)}
+#: Name -> members (0 is a single policy), whether there is a mask, the rating
+CASES = {
+    "single": (0, False, "tsallis"),
+    "masked": (0, True, "tsallis"),
+    "members": (3, False, "tsallis"),
+    "masked members": (3, True, "tsallis"),
+    "peak": (0, False, "peak"),
+    "masked peak": (0, True, "peak"),
+    "masked members of peak": (3, True, "peak"),
+    "masked prediction": (0, True, "prediction"),
+}
 ROWS, STEPS = 24, 4
 
 
@@ -33,28 +42,45 @@ def batch_of(members: int, masked: bool, step: int) -> TensorDict:
     return batch
 
 
+def as_sequences(batch: TensorDict) -> TensorDict:
+    """Each row as a sequence of one step, whose next observation is to be predicted."""
+    batch = batch.unsqueeze(-1)
+    batch["is_init"] = torch.ones(*batch.shape, 1, dtype=torch.bool)
+    batch["next", "observation"] = 2.0 * batch["observation"]
+    return batch
+
+
 def train(case: str, rank: int | None = None) -> dict[str, torch.Tensor]:
     """Trains by a share of each batch, or by all of it, and returns the outputs, the weights and phi."""
-    members, masked = CASES[case]
+    members, masked, kind = CASES[case]
     torch.manual_seed(0)
     actors = [make_policy(3, 2, hidden=(6,)) for _ in range(members or 1)]
-    gamma = ["adaptive", 0.0, "adaptive"] if members else "adaptive"
-    loss = TsallisBCLoss(actors if members else actors[0], gamma_mix=gamma).double()
+    policies = actors if members else actors[0]
+    if kind == "peak":
+        loss = TsallisBCLoss(policies, rating=PeakRating()).double()
+        updater, tuner, logged = None, ScoreTuner(loss, lr=1e-2), ["u", "distance"]
+    elif kind == "prediction":
+        loss = PredictiveBCLoss(make_recurrent_policy(3, 2, hidden_size=4, state_noise=0.0)).double()
+        updater, tuner, logged = CATSoftUpdate(loss), QTuner(loss, lr=1e-2), ["q"]
+    else:
+        gamma = ["adaptive", 0.0, "adaptive"] if members else "adaptive"
+        loss = TsallisBCLoss(policies, gamma_mix=gamma).double()
+        updater, tuner, logged = CATSoftUpdate(loss), QTuner(loss, lr=1e-2), ["q", "gamma_mix", "bound"]
     optimizer = AdaTerm(loss.parameters(), lr=1e-2, batch_dims=bool(members))
-    updater, tuner = CATSoftUpdate(loss), QTuner(loss, lr=1e-2)
     forward = loss if rank is None else DistributedDataParallel(loss)
     seen: dict[str, torch.Tensor] = {}
     for step in range(STEPS):
         batch = batch_of(members, masked, step)
         if rank is not None:
             batch = batch[..., rank * ROWS // 2 : (rank + 1) * ROWS // 2]
-        out = forward(batch)
-        out["loss_tsallis_bc"].backward()
+        out = forward(as_sequences(batch) if kind == "prediction" else batch)
+        sum(value for name, value in out.items() if name.startswith("loss_")).backward()
         optimizer.step()
         optimizer.zero_grad()
-        updater.step()
+        if updater is not None:
+            updater.step()
         out["objective"] = tuner.step()
-        names = ["q", "gamma_mix", "rating_mean", "rating_var", "ess", "log_prob", "bound", "objective"]
+        names = [*logged, "rating_mean", "rating_var", "ess", "log_prob", "objective"]
         seen |= {f"{name} of step {step}": out[name] for name in names}
     return seen | {"phi": tuner.phi.detach()} | {name: x.clone() for name, x in loss.state_dict().items()}
 

@@ -119,14 +119,14 @@ def test_a_target_that_nothing_updates_is_refused():
 
 
 def trainer_with_bad_batches(small, bad: set[int], **kwargs):
-    """A trainer whose batches of the given numbers have infinite actions."""
+    """A trainer whose batches of the given numbers have infinite observations."""
     trainer, loss = small.make_trainer(None, **kwargs)
     count = iter(range(1000))
 
     def spoil(batch: TensorDict) -> TensorDict:
         if next(count) in bad:
             batch = batch.clone()
-            batch["action"] = torch.full_like(batch["action"], math.inf)
+            batch["observation"] = torch.full_like(batch["observation"], math.inf)
         return batch
 
     trainer.register_op("process_optim_batch", spoil)

@@ -56,7 +56,7 @@ CHANGES = {
     "q_tuner.multiplier": ({}, {"multiplier": 10.0}),
     "q_tuner.optimizer.lr": ({}, {"tuner_lr": 0.01}),
     "loss.q": ({"tuned": False}, {"tuned": False, "q": 0.9}),
-    "loss.reference.gamma_min": ({}, {"gamma_min": 0.2}),
+    "loss.rating_module.gamma_low": ({}, {"gamma_min": 0.2}),
     "buffer.batch_size": ({}, {"batch_size": 8}),
     "optimizer.class": ({}, {"optimizer": torch.optim.Adam}),
     "q_tuner.class": ({}, {"tuned": False}),

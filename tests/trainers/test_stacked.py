@@ -123,9 +123,15 @@ def make_trainer(methods: list[str], seeds: list[int], folder=None, steps: int =
         buffer = make_stacked_replay_buffer(data, batch_size=16, seeds=seeds)
         updater, tuner = CATSoftUpdate(loss), QTuner(loss, tuned=tuned, lr=1e-2)
         optimizer = AdaTerm(loss.parameters(), lr=1e-2, batch_dims=1)
-    if bad is not None:  # values of this size pass the buffer's check and overflow in the network
-        buffer[bad * 64 : (bad + 1) * 64] = buffer[bad * 64 : (bad + 1) * 64].apply(lambda x: x * 1e300)
-    return make_offline_trainer(loss, buffer, optimizer, updater=updater, tuner=tuner, **settings, **kwargs)
+    trainer = make_offline_trainer(loss, buffer, optimizer, updater=updater, tuner=tuner, **settings, **kwargs)
+
+    def spoil(batch):
+        batch["observation"][bad] = torch.inf
+        return batch
+
+    if bad is not None:
+        trainer.register_op("process_optim_batch", spoil)
+    return trainer
 
 
 @pytest.mark.parametrize("clip_norm", [None, 0.5])
@@ -258,7 +264,7 @@ def test_errors_of_stacked_members():
     actors = [make_actor(0), make_actor(1)]
     with pytest.raises(ValueError, match="q has 3 values for 2 policies"):
         TsallisBCLoss(actors, q=[0.8, 0.8, 0.8])
-    with pytest.raises(ValueError, match="gamma_mix has 2 values for 1 policies"):
+    with pytest.raises(ValueError, match="gamma_mix has 2 values for 1 policies: give a number or one of each"):
         TsallisBCLoss(actors[0], gamma_mix=[0.0, 1.0])
     with pytest.raises(ValueError, match="gamma_mix must be"):
         TsallisBCLoss(actors, gamma_mix=[0.0, "auto"])

@@ -6,6 +6,7 @@ from torchrl_tsallis.evaluation.actor_policy import ActorPolicy
 from torchrl_tsallis.evaluation.flip_plots import error_curves, flip_trajectories, force_over_time, ratings_over_time
 from torchrl_tsallis.evaluation.flip_trials import FlipTrial, longest_single_run, run_flip_trial
 from torchrl_tsallis.evaluation.grid_plots import returns_grid
+from torchrl_tsallis.evaluation.level_plots import returns_by_level
 from torchrl_tsallis.evaluation.mean_policy import MeanPolicy
 from torchrl_tsallis.evaluation.plots import auroc_bars, rating_histogram, return_by_method, schedule
 from torchrl_tsallis.evaluation.recurrent_policy import RecurrentMeanPolicy
@@ -41,6 +42,7 @@ __all__ = [
     "ratings_over_time",
     "record_rollout",
     "return_by_method",
+    "returns_by_level",
     "returns_grid",
     "run_flip_trial",
     "schedule",

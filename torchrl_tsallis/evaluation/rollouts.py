@@ -102,14 +102,9 @@ def evaluate_policies(
             finally:
                 _stop()
         else:
-            for what, value in [("env_fn", env_fn), *((f"policy {name!r}", policy) for name, policy in ready.items())]:
-                try:
-                    pickle.dumps(value)
-                except Exception as error:
-                    raise ValueError(
-                        f"{what} cannot be pickled ({error}): define it in a module, or use workers=0"
-                    ) from error
-            for group, results in _in_workers(groups, (ready, env_fn, seed, max_steps), workers, retries):
+            pickled = [_dumped("env_fn", env_fn)]
+            pickled += [_dumped(f"policy {name!r}", policy) for name, policy in ready.items()]
+            for group, results in _in_workers(groups, (pickled, list(ready), seed, max_steps), workers, retries):
                 done.update(results)
                 tick(len(group))
     for name in ready:
@@ -132,10 +127,25 @@ def _start(policies: dict[str, Policy], env_fn: EnvFn, seed: int, max_steps: int
     _WORKER.update(policies=policies, env_fn=env_fn, seed=seed, max_steps=max_steps, envs=[])
 
 
-def _start_worker(policies: dict[str, Policy], *shared: Any) -> None:
-    """As :func:`_start`, in a worker: networks that a function names are the worker's own, not sent to it."""
-    _start(policies, *shared)
-    set_evaluation(policies.values())
+def _dumped(what: str, value: Any) -> bytes:
+    """Pickles what workers get."""
+    try:
+        return pickle.dumps(value)
+    except Exception as error:  # pickle raises whatever the parts do
+        raise ValueError(f"{what} cannot be pickled ({error}): define it in a module, or use workers=0") from error
+
+
+def _start_worker(pickled: list[bytes], names: list[str], seed: int, max_steps: int) -> None:
+    """Unpickles in a worker what its episodes share, ``env_fn`` first; what fails is told when there is work."""
+    loaded: list[Any] = []
+    for what, data in zip(["env_fn", *(f"policy {name!r}" for name in names)], pickled, strict=True):
+        try:
+            loaded.append(pickle.loads(data))
+        except Exception as error:  # here it would end the process without a word to the main one
+            _WORKER["failure"] = f"{what} cannot be loaded in a worker process ({type(error).__name__}: {error})"
+            return
+    set_evaluation(loaded[1:])  # networks that a function names are the worker's own, not sent to it
+    _start(dict(zip(names, loaded[1:], strict=True)), loaded[0], seed, max_steps)
 
 
 def _stop() -> None:
@@ -147,6 +157,8 @@ def _stop() -> None:
 
 def _work(group: list[Task]) -> dict[Task, Episode]:
     """Runs episodes of one policy together; an error names the one that failed."""
+    if "failure" in _WORKER:
+        raise RuntimeError(f"{_WORKER['failure']}: define it in a module that a worker can import, or use workers=0")
     name, first, envs = group[0][0], _WORKER["seed"], _WORKER["envs"]
     seeds, policy = [first + episode for _, episode in group], _WORKER["policies"][name]
     try:

@@ -123,12 +123,12 @@ class Rating(nn.Module):
 
     def __init__(self, beta: float | Sequence[float] = 0.0) -> None:
         super().__init__()
-        self._settings: list[str] = []
+        self._settings: dict[str, str] = {}  # buffer: what the user calls it
         self.add_setting("beta", beta, 0, 1)
         #: Whether any member has a scale-weighted likelihood.
         self.scale_weighted = bool((self.beta > 0).any())
 
-    def add_setting(self, name: str, value: Any, low: float, high: float) -> None:
+    def add_setting(self, name: str, value: Any, low: float, high: float, *, argument: str | None = None) -> None:
         """Registers a number in [low, high], or one for each stacked member, as a buffer.
 
         Args:
@@ -136,12 +136,14 @@ class Rating(nn.Module):
             value: a number, or a sequence of them.
             low: the least that is allowed.
             high: the largest that is allowed.
+            argument: what messages call it. Default: ``name``.
 
         Raises:
             ValueError: for anything else; the message names the setting.
         """
-        self.register_buffer(name, torch.tensor(as_numbers(name, value, low, high), dtype=torch.float32))
-        self._settings.append(name)
+        argument = argument or name
+        self.register_buffer(name, torch.tensor(as_numbers(argument, value, low, high), dtype=torch.float32))
+        self._settings[name] = argument
 
     def stack(self, num_members: int | None) -> None:
         """Gives every setting the shape ``[S]`` of stacked members, or checks that there are none.
@@ -152,12 +154,12 @@ class Rating(nn.Module):
         Raises:
             ValueError: if a setting was given for another number of policies.
         """
-        for name in self._settings:
+        for name, argument in self._settings.items():
             value = getattr(self, name)
             if value.ndim and len(value) != num_members:
                 raise ValueError(
-                    f"{name} has {len(value)} values for {num_members or 1} policies: give a number or one of each, "
-                    "and each loss a rating of its own"
+                    f"{argument} has {len(value)} values for {num_members or 1} policies: give a number or one of "
+                    "each, and each loss a rating of its own"
                 )
             if num_members is not None and not value.ndim:
                 setattr(self, name, value.repeat(num_members))

@@ -123,6 +123,7 @@ class ScoreTuner(RatingTuner):
     """
 
     rating_class = PeakRating
+    setting = "u"
     name = "score_tuner"
 
     def __init__(

@@ -36,6 +36,8 @@ class RatingTuner(TrainerHookBase):
 
     #: The ratings that it fits.
     rating_class: type[Rating] = Rating
+    #: Name of the setting that it tunes.
+    setting: str = ""
 
     def __init__(self, loss: TsallisBCLoss, *, tuned: Sequence[bool] | None, optimizer: MakeOptimizer) -> None:
         name, rating = type(self).__name__, getattr(loss, "rating_module", None)

@@ -76,7 +76,7 @@ def settings_of(trainer: Trainer) -> dict[str, Any]:
         By name, as JSON would give it back; ``optimizer.lr`` for one.
     """
     found: dict[str, Any] = {"trainer.clip_norm": trainer.clip_norm, "trainer.log_every": trainer.collector.steps}
-    tuned = any("tuner" in name for name in registered_modules(trainer))
+    tuned = {getattr(module, "setting", None) for module in registered_modules(trainer).values()}
     for name, part in _parts(trainer):
         if part is None:
             continue
@@ -84,9 +84,10 @@ def settings_of(trainer: Trainer) -> dict[str, Any]:
         own = _groups(part) if isinstance(part, torch.optim.Optimizer) else _public(part)
         if name == "buffer":
             own["batch_size"] = getattr(part, "batch_size", None)
-        if isinstance(part, nn.Module) and not tuned:  # what is tuned is a state
+        if isinstance(part, nn.Module):
             rated = getattr(part, "rating_module", part)  # a rating's settings are its own buffers
-            own |= {key: value.tolist() for key, value in rated.named_buffers(recurse=False)}
+            buffers = {key: value.tolist() for key, value in rated.named_buffers(recurse=False)}
+            own |= {key: value for key, value in buffers.items() if key not in tuned}  # what is tuned is a state
         found |= {f"{name}.{key}": value for key, value in own.items()}
     return json.loads(json.dumps(found))
 
@@ -124,7 +125,7 @@ def check_changes(changed: Mapping[str, tuple[Any, Any]], settings: Settings, pa
             f"{path!r} was made with other objects: {told}; the state of one does not fit another: make the trainer "
             "with those of before, or begin in another folder"
         )
-    left = [name for name in changed if name not in loaded and not name.startswith("loss.q")]
+    left = [name for name in changed if name not in loaded and not name.startswith(("loss.q", "loss.rating_module."))]
     if settings == "checkpoint" and left:
         raise ValueError(
             f"{path!r} cannot give back all of its settings ({told}): those of {', '.join(left)} are of objects "

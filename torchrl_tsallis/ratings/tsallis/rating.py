@@ -77,8 +77,8 @@ class TsallisRating(Rating):
             raise ValueError(f"0 < gamma_min <= gamma_max < 1 is needed, got {gamma_min=} and {gamma_max=}")
         self.add_setting("q", q, 0, 1)
         # A fixed level is an adaptive one between equal bounds.
-        self.add_setting("gamma_low", _levels(gamma_mix, gamma_min), 0, 1)
-        self.add_setting("gamma_high", _levels(gamma_mix, gamma_max), 0, 1)
+        self.add_setting("gamma_low", _levels(gamma_mix, gamma_min), 0, 1, argument="gamma_mix")
+        self.add_setting("gamma_high", _levels(gamma_mix, gamma_max), 0, 1, argument="gamma_mix")
         self.moment = RunningMean()
         self._sort_members()
 

@@ -177,6 +177,7 @@ class QTuner(RatingTuner):
     """
 
     rating_class = TsallisRating
+    setting = "q"
     name = "q_tuner"
 
     def __init__(
