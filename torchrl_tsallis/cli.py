@@ -71,9 +71,9 @@ def export(folder: tyro.conf.Positional[Path], /, onnx: Annotated[Path, tyro.con
 
 def main(args: Sequence[str] | None = None) -> None:
     """Runs a command; exit code 0, 1 with one line for an error, 2 for --fail-below."""
-    commands = {"info": info, "rate": rate, "export": export}
+    commands: dict[str, Any] = {"info": info, "rate": rate, "export": export}
     try:
-        code = tyro.extras.subcommand_cli_from_dict(commands, args=args)
+        code: int = tyro.extras.subcommand_cli_from_dict(commands, args=args)
     except KeyboardInterrupt:
         sys.stderr.write("tsallis: stopped; nothing was written\n")
         code = 130

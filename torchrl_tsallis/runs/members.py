@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
@@ -92,11 +93,11 @@ class Members:
         """
         device = next(self.loss.parameters()).device
         distance, rating = (torch.empty(len(self.scalings), len(data)) for _ in range(2))
-        share = self.loss.rating_module.variance_share[:, None]
+        share: Tensor = self.loss.rating_module.variance_share[:, None]
         for start in range(0, len(data), chunk_size):
             part = slice(start, min(start + chunk_size, len(data)))
             rows = data[part].select("observation", "action").clone()
-            scaled = torch.stack([scaling(rows) for scaling in self.scalings]).to(device)
+            scaled: Any = torch.stack([scaling(rows) for scaling in self.scalings]).to(device)  # type: ignore[arg-type]
             with evaluating(self.loss, self.loss.actor_network):
                 dist = get_stacked_dist(self.loss.actor_network, scaled, self.loss.actor_network_params)
                 normal = diagonal_normal(dist, scaled["action"])

@@ -30,6 +30,11 @@ class ScaledNetwork(nn.Module):
         (tensor([[5.]]), tensor([[2.]]))
     """
 
+    observation_centre: Tensor
+    observation_scale: Tensor
+    action_centre: Tensor
+    action_scale: Tensor
+
     def __init__(self, network: nn.Module, scaling: RobustScaling) -> None:
         super().__init__()
         self.network = network

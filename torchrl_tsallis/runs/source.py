@@ -73,7 +73,7 @@ def identity(data: TensorDictBase) -> str:
     Examples:
         >>> from tensordict import TensorDict
         >>> identity(TensorDict({"observation": torch.zeros(2, 1), "action": torch.zeros(2, 1)}, [2]))[:8]
-        'f9e7a02b'
+        '36de8ba9'
     """
     digest = hashlib.sha256()
     entries: dict[str, Tensor] = {key: data[key] for key in _KEYS}
