@@ -1,84 +1,74 @@
-"""The command line ``tsallis``: a thin layer over :mod:`torchrl_tsallis.run`."""
+"""The command line ``tsallis``, see :mod:`torchrl_tsallis.commands`: errors become one line and an exit code.
+
+====  ===========================================================================
+code  meaning
+====  ===========================================================================
+0     done
+1     an error, or a command that cannot be understood; one line on stderr says it
+2     done, but not usable enough for ``--fail-below``
+130   stopped by Ctrl-C; nothing was written
+====  ===========================================================================
+"""
 
 from __future__ import annotations
 
-import json
-import shlex
+import logging
 import sys
-from collections.abc import Sequence
-from pathlib import Path
-from typing import Annotated, Any
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 
-import tyro
-
-
-def _say(value: dict[str, Any], text: str, as_json: bool) -> None:
-    sys.stdout.write((json.dumps(value, default=str) if as_json else text) + "\n")
+#: What is said of a command that fails; anything else is a fault of this package, and shows where.
+_ERRORS = (OSError, KeyError, TypeError, ValueError, ImportError, RuntimeError, ArithmeticError, MemoryError)
 
 
-def info(path: tyro.conf.Positional[Path], /, format: str | None = None, json: bool = False) -> int:
-    """Says what a file holds; nothing is trained."""
-    from torchrl_tsallis.data.readers import describe
-
-    found = describe(path, format=format)
-    keys = "".join(
-        f"\n  {key}: {column.dtype} {list(column.shape)} {column.role}" for key, column in found.columns.items()
-    )
-    _say(found.to_json(), f"{found.format}: {len(found.episodes)} episodes, {found.steps} steps{keys}", json)
-    return 0
+def _line(error: BaseException) -> str:
+    """An error as one line."""
+    first = error.args[0] if isinstance(error, KeyError) and error.args else error
+    return " ".join(str(first).split()) or type(error).__name__
 
 
-def rate(
-    path: tyro.conf.Positional[Path],
-    /,
-    out: Path = Path("ratings"),
-    obs: tuple[str, ...] | None = None,
-    action: str | None = None,
-    episode: str | None = None,
-    format: str | None = None,
-    filter_key: str | None = None,
-    steps: int | None = None,
-    seeds: int = 3,
-    folds: int = 2,
-    device: str = "cpu",
-    overwrite: bool = False,
-    json: bool = False,
-    fail_below: float | None = None,
-) -> int:
-    """Rates demonstrations; with --fail-below X the exit code is 2 where the seeds agree less than X, or not usable."""
-    from torchrl_tsallis.run import rate as rate_
-
-    command = shlex.join(["tsallis", *sys.argv[1:]])
-    run = rate_(
-        path, out, obs=obs, action=action, episode=episode, format=format, filter_key=filter_key, steps=steps,
-        seeds=seeds, folds=folds, device=device, overwrite=overwrite, progress=not json, command=command,
-    )  # fmt: skip
-    summary = run.summary
-    _say({"out": str(out), **summary}, f"{summary['sentence']}\n{out}", json)
-    rho = summary["agreement"]["spearman"]
-    return 2 if fail_below is not None and (not summary["usable"] or rho is None or rho < fail_below) else 0
-
-
-def export(folder: tyro.conf.Positional[Path], /, onnx: Annotated[Path, tyro.conf.arg()], json: bool = False) -> int:
-    """Writes the mean policy of a run as ONNX, with its scaling inside."""
-    from torchrl_tsallis.runs import Run
-    from torchrl_tsallis.runs.policies import export_onnx
-
-    apart = export_onnx(Run.open(folder).network(), onnx)
-    _say({"onnx": str(onnx), "difference": apart}, f"{onnx} (difference of onnxruntime: {apart})", json)
-    return 0
+@contextmanager
+def _logs_on_stderr() -> Iterator[None]:
+    """TorchRL's logger writes to stdout, where only answers belong."""
+    handlers = [h for h in logging.getLogger("torchrl").handlers if isinstance(h, logging.StreamHandler)]
+    before = [handler.setStream(sys.stderr) for handler in handlers]
+    try:
+        yield
+    finally:
+        for handler, stream in zip(handlers, before, strict=True):
+            if stream is not None:
+                handler.setStream(stream)
 
 
 def main(args: Sequence[str] | None = None) -> None:
-    """Runs a command; exit code 0, 1 with one line for an error, 2 for --fail-below."""
-    commands: dict[str, Any] = {"info": info, "rate": rate, "export": export}
+    """Runs a command and exits.
+
+    Args:
+        args: of the command. Default: those of the process.
+
+    Raises:
+        SystemExit: always, with the exit code.
+    """
+    given = list(sys.argv[1:] if args is None else args)
     try:
-        code: int = tyro.extras.subcommand_cli_from_dict(commands, args=args)
+        import tyro
+    except ImportError:
+        sys.stderr.write("tsallis: the command line needs tyro: pip install 'torchrl-tsallis[cli]'\n")
+        sys.exit(1)
+    from torchrl_tsallis.commands import COMMANDS
+
+    try:
+        with _logs_on_stderr():
+            call = tyro.extras.subcommand_cli_from_dict(
+                COMMANDS, args=given, prog="tsallis", config=(tyro.conf.FlagCreatePairsOff,)
+            )
+            code = call(given)
+    except SystemExit as stop:  # of tyro: 0 after --help, 2 for what it cannot parse, which has another meaning here
+        code = 1 if stop.code else 0
     except KeyboardInterrupt:
         sys.stderr.write("tsallis: stopped; nothing was written\n")
         code = 130
-    except (OSError, KeyError, TypeError, ValueError, ImportError, RuntimeError, ArithmeticError) as error:
-        text = error.args[0] if isinstance(error, KeyError) and error.args else error
-        sys.stderr.write("tsallis: " + " ".join(str(text).split()) + "\n")
+    except _ERRORS as error:
+        sys.stderr.write(f"tsallis: {_line(error)}\n")
         code = 1
     sys.exit(code)

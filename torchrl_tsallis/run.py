@@ -6,32 +6,26 @@ Importing the command line, a report or any format's library is not needed for i
 from __future__ import annotations
 
 import os
-import platform
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-import safetensors
-import tensordict
 import torch
-import torchrl
-from safetensors.torch import save_file
 from tensordict import TensorDictBase
-from torch import Tensor
 
 from torchrl_tsallis._checks import check_number
 from torchrl_tsallis.data.hygiene import inspect_demonstrations
 from torchrl_tsallis.data.signals import episode_signals
 from torchrl_tsallis.jobs.files import atomic_path
-from torchrl_tsallis.runs.folder import FORMAT, RUN, check_free, new_folder, write_json
+from torchrl_tsallis.runs.card import model_card
+from torchrl_tsallis.runs.folder import check_free, new_folder, write_json
 from torchrl_tsallis.runs.held_out import hold_out
 from torchrl_tsallis.runs.judgement import judge
-from torchrl_tsallis.runs.members import BETA, LR, Members, Split, make_splits, train_members
+from torchrl_tsallis.runs.members import LR, Members, Split, check_device, make_splits, train_members
 from torchrl_tsallis.runs.opened import Run
+from torchrl_tsallis.runs.saved import save_run
 from torchrl_tsallis.runs.source import Source, load_source
 from torchrl_tsallis.runs.tables import write_tables
-from torchrl_tsallis.version import __version__
 
 __all__ = ["Run", "default_steps", "rate", "train"]
 
@@ -120,7 +114,8 @@ def rate(
     """
     for name, value, low in (("seeds", seeds, 1), ("folds", folds, 2), ("batch_size", batch_size, 1)):
         check_number(name, value, low=low, integer=True)
-    check_free(out, overwrite)
+    check_device(device)
+    _check_place(path_or_data, out, overwrite)
     source = load_source(path_or_data, obs=obs, action=action, episode=episode, format=format, filter_key=filter_key)
     data, episodes = source.data, source.episodes()
     steps = _steps(steps, len(data), batch_size)
@@ -187,7 +182,8 @@ def train(
     """
     check_number("batch_size", batch_size, low=1, integer=True)
     check_number("seed", seed, low=0, integer=True)
-    check_free(out, overwrite)
+    check_device(device)
+    _check_place(path_or_data, out, overwrite)
     source = load_source(path_or_data, obs=obs, action=action, episode=episode, format=format, filter_key=filter_key)
     steps = _steps(steps, len(source.data), batch_size)
     split = Split(seed, torch.zeros(len(source.data), dtype=torch.bool))
@@ -196,7 +192,9 @@ def train(
             source.data, [split], steps=steps, batch_size=batch_size, device=device, progress=progress
         )
         numbers = {"steps": steps, "batch_size": batch_size, "seed": seed, "lr": LR}
-        _write_policy(folder, members, 0, source, "policy", numbers, command or "torchrl_tsallis.run.train")
+        settings = _write_policy(folder, members, 0, source, "policy", numbers, command or "torchrl_tsallis.run.train")
+        with atomic_path(folder / "README.md") as card:
+            card.write_text(model_card(settings, os.fspath(out)), encoding="utf-8")
     return Run.open(out)
 
 
@@ -205,42 +203,24 @@ def _steps(steps: int | None, rows: int, batch_size: int) -> int:
     return int(check_number("steps", given, low=1, integer=True))
 
 
-def _save(path: Path, state: dict[str, Tensor]) -> None:
-    with atomic_path(path) as temporary:
-        save_file({name: value.contiguous() for name, value in state.items()}, temporary)
+def _check_place(
+    path_or_data: str | os.PathLike[str] | TensorDictBase, out: str | os.PathLike[str], overwrite: bool
+) -> None:
+    check_free(out, overwrite, path_or_data if isinstance(path_or_data, (str, os.PathLike)) else None)
 
 
 def _write_policy(
     folder: Path, members: Members, member: int, source: Source, kind: str, numbers: dict[str, Any], command: str
-) -> None:
-    """Writes what opens again as a :class:`Run`; ``run.json`` last, which makes it one."""
-    rating = members.rating_state(member)
+) -> dict[str, Any]:
     obs_dim, action_dim = source.dims
-    _save(folder / "policy.safetensors", members.actor_state(member))
-    _save(folder / "rating.safetensors", rating)
-    write_json(folder / "scaling.json", members.scalings[member].to_json())
-    versions = {
-        "torchrl_tsallis": __version__,
-        "python": platform.python_version(),
-        "torch": torch.__version__,
-        "torchrl": torchrl.__version__,
-        "tensordict": tensordict.__version__,
-        "numpy": np.__version__,
-        "safetensors": safetensors.__version__,
-    }
-    write_json(
-        folder / RUN,
-        {
-            "format": FORMAT,
-            "kind": kind,
-            "method": {"rating": "peak", "u": float(rating["u"]), "beta": BETA},
-            "policy": {
-                "factory": "torchrl_tsallis.modules.make_policy",
-                "arguments": {"obs_dim": obs_dim, "action_dim": action_dim},
-            },
-            "data": source.to_json(),
-            "train": numbers,
-            "versions": versions,
-            "command": command,
-        },
+    return save_run(
+        folder,
+        kind=kind,
+        actor=members.actor_state(member),
+        rating=members.rating_state(member),
+        arguments={"obs_dim": obs_dim, "action_dim": action_dim},
+        data=source.to_json(),
+        train=numbers,
+        command=command,
+        scaling=members.scalings[member],
     )

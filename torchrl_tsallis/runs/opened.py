@@ -7,9 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from safetensors import SafetensorError
-from safetensors.torch import load_file
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule
 from torch import Tensor
 from torchrl.modules import IndependentNormal, ProbabilisticActor
@@ -17,10 +15,11 @@ from torchrl.modules import IndependentNormal, ProbabilisticActor
 from torchrl_tsallis.data.robust_scaling import RobustScaling
 from torchrl_tsallis.modules.policy import make_policy
 from torchrl_tsallis.objectives.bc import TsallisBCLoss
-from torchrl_tsallis.ratings.peak import PeakRating
-from torchrl_tsallis.runs.folder import FORMAT, RUN, read_csv, read_json
+from torchrl_tsallis.runs.folder import RUN, read_csv, read_json
 from torchrl_tsallis.runs.policies import ScaledMeanPolicy, ScaledNetwork
+from torchrl_tsallis.runs.saved import load_tensors, make_rating, read_scaling, read_settings
 from torchrl_tsallis.runs.source import Source, load_source
+from torchrl_tsallis.runs.tables import EPISODES, RATINGS
 
 
 class Run:
@@ -38,12 +37,7 @@ class Run:
 
     def __init__(self, folder: str | os.PathLike[str]) -> None:
         self.folder = Path(folder).expanduser()
-        self.settings = read_json(self.folder / RUN)
-        if self.settings.get("format") != FORMAT:
-            raise ValueError(
-                f"{str(self.folder)!r} has the format {self.settings.get('format')!r}, this version reads {FORMAT}: "
-                "make the run again"
-            )
+        self.settings = read_settings(self.folder)
         self._loss: TsallisBCLoss | None = None
 
     @classmethod
@@ -55,34 +49,23 @@ class Run:
         """Folder and kind."""
         return f"Run({str(self.folder)!r}, kind={self.settings.get('kind')!r})"
 
-    def _tensors(self, name: str) -> dict[str, Tensor]:
-        path = self.folder / name
-        if not path.is_file():
-            raise FileNotFoundError(f"{str(path)!r} is not there: the run is not complete, make it again")
-        try:
-            return load_file(path)
-        except SafetensorError as error:
-            raise ValueError(f"{str(path)!r} is broken ({error}): make the run again") from error
-
     def _policy(self) -> ProbabilisticActor:
         """The actor of scaled observations and actions."""
-        policy = self.settings.get("policy", {})
-        if policy.get("factory") != "torchrl_tsallis.modules.make_policy":
-            raise ValueError(f"{str(self.folder)!r} has a policy of {policy.get('factory')!r}, which is not known here")
-        actor = make_policy(**policy["arguments"])
+        file = self.folder / "policy.safetensors"
+        state = load_tensors(file)
         try:
-            actor.load_state_dict(self._tensors("policy.safetensors"))
-        except RuntimeError as error:
+            actor = make_policy(**self.settings["policy"]["arguments"])
+            actor.load_state_dict(state)
+        except (RuntimeError, TypeError, ValueError, KeyError) as error:
             raise ValueError(
-                f"{str(self.folder / 'policy.safetensors')!r} is no state of the policy that {RUN} describes: make the "
-                "run again"
+                f"{str(file)!r} is no state of the policy that {RUN} describes: make the run again"
             ) from error
         return actor.eval()
 
     @property
     def scaling(self) -> RobustScaling:
         """Centres and scales of the policy's training data."""
-        return RobustScaling.from_json(read_json(self.folder / "scaling.json"))
+        return read_scaling(self.folder, self.settings["policy"]["arguments"])
 
     def network(self) -> ScaledNetwork:
         """The network from an observation to mean and scale of the action, in the units of the data."""
@@ -103,31 +86,40 @@ class Run:
 
     def numpy_policy(self) -> ScaledMeanPolicy:
         """The mean action without torch, in the units of the data."""
-        return ScaledMeanPolicy.of(self._tensors("policy.safetensors"), self.scaling)
+        return ScaledMeanPolicy.of(self._policy().state_dict(), self.scaling)
 
     def loss(self) -> TsallisBCLoss:
         """The loss that the policy was trained by, of scaled data, with its rating as it was in the end."""
         if self._loss is None:
-            loss = TsallisBCLoss(self._policy(), rating=PeakRating(beta=self.settings["method"]["beta"]))
+            loss = TsallisBCLoss(self._policy(), rating=make_rating(self.settings["method"]))
+            file = self.folder / "rating.safetensors"
+            state = load_tensors(file)
             try:
-                loss.rating_module.load_state_dict(self._tensors("rating.safetensors"))
-            except RuntimeError as error:
+                loss.rating_module.load_state_dict(state)
+                if loss.needs_target:
+                    file = self.folder / "target.safetensors"
+                    target = TensorDict(load_tensors(file), []).unflatten_keys(".")
+                    loss.target_actor_network_params.data.update_(target)
+            except (RuntimeError, KeyError) as error:
                 raise ValueError(
-                    f"{str(self.folder / 'rating.safetensors')!r} is no state of the rating: make the run again"
+                    f"{str(file)!r} is no state of the rating that {RUN} describes: make the run again"
                 ) from error
             self._loss = loss.eval()
         return self._loss
 
     def read(self, data: str | os.PathLike[str] | TensorDictBase) -> Source:
-        """Reads data by the keys of the run's own.
+        """Reads data by the keys of the run's own, where it was read from a file.
 
         Raises:
             ValueError: if its dimensions are others.
         """
-        keys = self.settings["data"]["keys"]
-        stored = self.settings["data"]["format"] != "memory" and not isinstance(data, TensorDictBase)
-        action = keys["action"] if len(keys["action"]) > 1 else keys["action"][0]
-        source = load_source(data, obs=keys["observation"], action=action) if stored else load_source(data)
+        about = self.settings["data"]
+        keys = about["keys"]
+        if about["format"] == "memory" or isinstance(data, TensorDictBase):
+            source = load_source(data)
+        else:
+            action = keys["action"] if len(keys["action"]) > 1 else keys["action"][0]
+            source = load_source(data, obs=keys["observation"], action=action, episode=about.get("episode"))
         arguments = self.settings["policy"]["arguments"]
         wanted = (arguments["obs_dim"], arguments["action_dim"])
         if source.dims != wanted:
@@ -165,17 +157,29 @@ class Run:
         """
         return self._ask("surprise", data, chunk_size)
 
+    def _table(self, name: str) -> Path:
+        if self.settings["kind"] != "ratings":
+            raise FileNotFoundError(
+                f"{str(self.folder)!r} is the run of a policy and has no {name}: `tsallis rate` rates demonstrations"
+            )
+        return self.folder / name
+
     @property
     def summary(self) -> dict[str, Any]:
         """``summary.json``: whether the ratings are usable, and the verdict."""
-        return read_json(self.folder / "summary.json")
+        file = self._table("summary.json")
+        found = read_json(file)
+        missing = [name for name in ("usable", "reasons", "agreement", "calibration", "sentence") if name not in found]
+        if missing:
+            raise ValueError(f"{str(file)!r} does not say {missing[0]!r}: make the run again")
+        return found
 
     @property
     def episodes(self) -> list[dict[str, str]]:
         """``episodes.csv``: one dictionary an episode, in the order of the data."""
-        return read_csv(self.folder / "episodes.csv")
+        return read_csv(self._table("episodes.csv"), EPISODES, self.settings["data"].get("episodes"))
 
     @property
     def ratings(self) -> list[dict[str, str]]:
         """``ratings.csv``: one dictionary a row."""
-        return read_csv(self.folder / "ratings.csv")
+        return read_csv(self._table("ratings.csv"), RATINGS, self.settings["data"].get("steps"))

@@ -2,7 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import importlib.util
+import logging
+import os
+import warnings
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,6 +17,7 @@ from torch import Tensor, nn
 
 from torchrl_tsallis.data.robust_scaling import RobustScaling
 from torchrl_tsallis.evaluation.mean_policy import MeanPolicy
+from torchrl_tsallis.jobs.files import atomic_path
 
 
 class ScaledNetwork(nn.Module):
@@ -96,26 +103,40 @@ class ScaledMeanPolicy:
         return (mean * unit + zero).astype(np.float32)
 
 
-def export_onnx(network: ScaledNetwork, path: Any) -> float | None:
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Torch's exporters warn of themselves, and of packages that the policy does not need."""
+    log = logging.getLogger("torch.onnx")
+    level = log.level
+    log.setLevel(logging.ERROR)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            yield
+    finally:
+        log.setLevel(level)
+
+
+def export_onnx(network: ScaledNetwork, path: str | os.PathLike[str], *, overwrite: bool = False) -> float | None:
     """Writes the mean policy, with its scaling inside, as ONNX: ``observation`` ``[B, O]`` to ``action`` ``[B, A]``.
 
     Args:
         network: of a run.
         path: the file.
+        overwrite: whether a file that is there is replaced.
 
     Returns:
         The largest difference between onnxruntime's actions and torch's, in the actions' scales, on 64 observations
         about the data's centre; None where onnxruntime is not installed.
 
     Raises:
+        FileExistsError: if there is something at ``path``.
         ImportError: if torch's exporter lacks its packages; the message names them.
         RuntimeError: if onnxruntime gives other actions; nothing is written then.
     """
-    import importlib.util
-    import warnings
-
-    from torchrl_tsallis.jobs.files import atomic_path
-
+    path = Path(path).expanduser()
+    if path.is_dir() or (path.exists() and not overwrite):
+        raise FileExistsError(f"{str(path)!r} exists: choose another file, or replace it (overwrite=True, --overwrite)")
     missing = [name for name in ("onnx", "onnxscript") if importlib.util.find_spec(name) is None]
     if missing:
         raise ImportError(f"the export to ONNX needs {' and '.join(missing)}: pip install {' '.join(missing)}")
@@ -125,8 +146,7 @@ def export_onnx(network: ScaledNetwork, path: Any) -> float | None:
     x = centre + scale * torch.randn(64, len(centre), generator=generator)
     shapes = ({0: torch.export.Dim("batch")},)
     with atomic_path(path) as temporary, torch.no_grad():
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # torch's exporters warn of themselves
+        with _quiet():
             torch.onnx.export(
                 mean,
                 (x,),

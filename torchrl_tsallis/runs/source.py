@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -33,6 +33,8 @@ class Source:
         format: of the file; ``"memory"`` for data in memory.
         keys: read as observation and as action.
         names: of the episodes in the source.
+        layout: of a concatenated observation, each key with its first dimension and the one after its last.
+        chosen: ``episode`` and ``filter_key``, where they were given.
     """
 
     data: TensorDictBase
@@ -40,6 +42,8 @@ class Source:
     format: str
     keys: dict[str, list[str]]
     names: tuple[str, ...]
+    layout: tuple[tuple[str, int, int], ...] = ()
+    chosen: dict[str, str] = field(default_factory=dict)
 
     @property
     def dims(self) -> tuple[int, int]:
@@ -62,6 +66,8 @@ class Source:
             "format": self.format,
             "identity": identity(self.data),
             "keys": self.keys,
+            "layout": [list(part) for part in self.layout],
+            **self.chosen,
             "episodes": episodes,
             "steps": len(self.data),
         }
@@ -123,11 +129,12 @@ def load_source(
         data = path_or_data if _single(path_or_data) else as_dtype(path_or_data, torch.float32)
         path, form, keys = "", "memory", {key: [key] for key in _KEYS}
         names: tuple[str, ...] | None = None
+        layout: tuple[tuple[str, int, int], ...] = ()
     elif isinstance(path_or_data, (str, os.PathLike)):
         found = read_demonstrations(
             path_or_data, observation=obs, action=action, episode=episode, format=format, filter_key=filter_key
         )
-        data, names = found.data, found.source.episodes
+        data, names, layout = found.data, found.source.episodes, tuple(found.source.layout)
         path, form = str(Path(found.source.path).resolve()), found.source.format
         keys = {"observation": list(found.source.observation), "action": list(found.source.action)}
     else:
@@ -137,7 +144,8 @@ def load_source(
         count = len(find_episodes(data, open_end=True).starts) if has_episodes(data) else 0
     if names is None or len(names) != count:  # files without episodes, and data in memory
         names = tuple(map(str, range(count)))
-    return Source(data, path, form, keys, names)
+    options = {name: value for name, value in (("episode", episode), ("filter_key", filter_key)) if value is not None}
+    return Source(data, path, form, keys, names, layout, options)
 
 
 def _single(data: TensorDictBase) -> bool:
