@@ -56,7 +56,8 @@ class Rate(Reads):
         train: of the policies.
         device: of the policies, such as cuda.
         overwrite: whether an earlier run in the folder is replaced.
-        fail_below: exit with 2 where the rating is not usable, or the seeds' orders agree less (Spearman).
+        fail_below: exit with 2 where the rating is not usable, or the seeds agree less (the greater one of Spearman's rho
+            and the reliability, in summary.json).
     """
 
     out: Path = Path("ratings")
@@ -93,8 +94,8 @@ class Rate(Reads):
             failed = 1
         answer = {"out": str(self.out), "report": None if page is None else str(page), **summary}
         say(answer, f"{summary['sentence']}\n{self.out if page is None else page}", self.json)
-        rho = summary["agreement"]["spearman"]
-        low = self.fail_below is not None and (not summary["usable"] or rho is None or rho < self.fail_below)
+        agree = max((summary["agreement"].get(name) or -1.0 for name in ("spearman", "reliability")), default=-1.0)
+        low = self.fail_below is not None and (not summary["usable"] or agree < self.fail_below)
         return failed or 2 * low
 
 
