@@ -124,14 +124,19 @@ def run(kind: str, folder: Path) -> None:
     return None
 
 
+def marks(folder: Path) -> list[Path]:
+    """What trainings leave once they begin; the folders below come and go while one looks, these do not."""
+    return [*folder.glob("began"), *folder.glob("*/began")]
+
+
 def start(kind: str, folder: Path) -> subprocess.Popen:
     """A process of :func:`run`, which has begun to train when this returns, or has ended."""
     folder.mkdir(parents=True, exist_ok=True)
-    for mark in folder.rglob("began"):
+    for mark in marks(folder):
         mark.unlink()
     command = [sys.executable, __file__, "--run", kind, str(folder)]
     process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, env=os.environ | {"OMP_NUM_THREADS": "1"})
-    while process.poll() is None and not any(folder.rglob("began")):
+    while process.poll() is None and not marks(folder):
         time.sleep(0.005)
     return process
 

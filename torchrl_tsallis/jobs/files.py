@@ -10,7 +10,9 @@ from contextlib import contextmanager
 from pathlib import Path
 
 #: What is in the errors of libraries that write by themselves, as torch and safetensors: they are no OSError.
-_TEXTS = {os.strerror(code).lower(): code for code in (errno.ENOSPC, errno.EROFS, errno.EACCES, errno.EDQUOT)}
+_TEXTS = {
+    os.strerror(code).lower(): code for code in (errno.ENOSPC, errno.EROFS, errno.EACCES, errno.EDQUOT, errno.EFBIG)
+}
 _TEXTS |= {"iostream error": errno.EIO, "inline_container.cc": errno.EIO}  # torch.save keeps the reason to itself
 
 

@@ -11,13 +11,17 @@ from tensordict import TensorDict, TensorDictBase, TensorDictParams
 from tensordict.nn import ProbabilisticTensorDictSequential, dispatch
 from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor
-from torch.distributions import Distribution
 from torchrl.objectives.common import LossModule
 
+<<<<<<< HEAD
 from torchrl_tsallis._checks import check_choice, check_flag
 from torchrl_tsallis.objectives.actor import get_dist, get_stacked_dist, log_prob_of, own_parameters
+=======
+from torchrl_tsallis.objectives.actor import own_parameters
+>>>>>>> main
 from torchrl_tsallis.objectives.asking import AskedLoss
-from torchrl_tsallis.objectives.inputs import check_actors, check_key, mask_of, select_inputs
+from torchrl_tsallis.objectives.inputs import check_actors, check_key
+from torchrl_tsallis.objectives.passes import ActorPasses
 from torchrl_tsallis.ratings.base import Evidence, Rated, Rating
 from torchrl_tsallis.ratings.batch import Batch, rating_statistics
 from torchrl_tsallis.ratings.tsallis import TsallisRating
@@ -25,7 +29,7 @@ from torchrl_tsallis.ratings.tsallis import TsallisRating
 _STATISTICS = ("rating_mean", "rating_var", "ess", "log_prob")
 
 
-class TsallisBCLoss(AskedLoss, LossModule):
+class TsallisBCLoss(ActorPasses, AskedLoss, LossModule):
     r"""Noise-robust behavioral cloning: every sample counts by its rating (eq. 10).
 
     .. math::
@@ -199,39 +203,6 @@ class TsallisBCLoss(AskedLoss, LossModule):
     def batch_of(self, mask: Tensor | None, sync: bool = True) -> Batch:
         """What a mean over a batch with a mask ``[*B]`` means: of its members, and of all processes if ``sync``."""
         return Batch.of(mask, self.num_members is not None, sync and self.sync_stats, self.process_group)
-
-    def _pass(self, inputs: TensorDictBase, params: TensorDictBase) -> tuple[Distribution, Any]:
-        """The distribution, and what else a variant of the loss needs of the same pass of the network."""
-        if self.num_members is not None:
-            return get_stacked_dist(self.actor_network, inputs, params, self.vmap_randomness), None
-        with params.to_module(self.actor_network, preserve_module_state=False):
-            return get_dist(self.actor_network, inputs), None
-
-    @torch.no_grad()
-    def _target_log_prob(self, inputs: TensorDictBase) -> Tensor | None:
-        """The target network's log-density; 0 for members that are not rated by it, whose pass is saved."""
-        if not self.needs_target:
-            return None
-        params, key = self.target_actor_network_params, self.tensor_keys.action
-        if self.target_members is None:
-            return log_prob_of(self._pass(inputs, params)[0], inputs, key)
-        index = self.target_members.nonzero()[:, 0]
-        some = inputs[index]
-        log_prob = log_prob_of(self._pass(some, params.data[index])[0], some, key)
-        return log_prob.new_zeros(inputs.shape).index_copy(0, index.to(log_prob.device), log_prob)
-
-    def _evidence(self, tensordict: TensorDictBase, sync: bool) -> Evidence:
-        """What the rating is given: one pass of the network, and one of the target's where the rating asks for it."""
-        mask, key = mask_of(self, tensordict), self.tensor_keys.action
-        batch = self.batch_of(mask, sync)
-        dtype = next((p.dtype for p in self.actor_network_params.parameters() if p.is_floating_point()), None)
-        inputs = select_inputs(
-            tensordict, self.actor_network, self.in_keys, members=self.num_members, mask=mask, dtype=dtype
-        )
-        dist, written = self._pass(inputs, self.actor_network_params)
-        action, log_prob = inputs.get(key), log_prob_of(dist, inputs, key)
-        likelihood = self.rating_module.likelihood(log_prob, dist, action, batch)
-        return Evidence(log_prob, likelihood, dist, action, self._target_log_prob(inputs), batch, written)
 
     def _rate(self, tensordict: TensorDictBase, sync: bool = True) -> tuple[Evidence, Rated]:
         """Rates a batch."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
@@ -11,6 +11,8 @@ from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey, expand_right, unravel_key
 from torch import Tensor, nn
 from torchrl.objectives.common import LossModule
+
+from torchrl_tsallis.ratings.base import Evidence
 
 #: Numbers from here on are taken for infinitely far: their squares leave the range of float32.
 FAR = 1e18
@@ -159,3 +161,37 @@ def action_dims(loss: LossModule, inputs: TensorDictBase) -> int:
         if isinstance(action, Tensor):
             return action.shape[inputs.ndim :].numel()
     raise ValueError(f"{type(loss).__name__} names no action: say by dims= how many dimensions its loss is a mean over")
+
+
+def means_of_others(
+    evidence: Evidence, loss_key: str, name_of: Callable[[NestedKey], NestedKey]
+) -> dict[NestedKey, Tensor]:
+    """Means over a batch of what a loss returns beside the loss of each sample.
+
+    Args:
+        evidence: whose ``written`` is what the loss has returned.
+        loss_key: of the loss of each sample.
+        name_of: gives the name of a mean from the key.
+
+    Returns:
+        The means, detached scalars.
+
+    Raises:
+        ValueError: if another output is a loss with gradient, which nobody would minimise.
+    """
+    out, shape = {}, evidence.likelihood.shape
+    for key, value in evidence.written.items(True, True):
+        if key == loss_key:
+            continue
+        if isinstance(key, str) and key.startswith("loss") and value.requires_grad:
+            raise ValueError(
+                f"the loss is {loss_key!r}, but {key!r} has a gradient too: RatedLoss minimises one output, "
+                "which has to be the sum of all terms"
+            )
+        value = value.detach().to(evidence.likelihood.dtype)
+        if value.shape[: len(shape)] == shape:
+            rest = value.flatten(len(shape)).mean(-1) if value.ndim > len(shape) else value
+            (out[name_of(key)],) = evidence.batch.mean(rest)
+        else:
+            out[name_of(key)] = value.mean()
+    return out

@@ -10,13 +10,20 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import dispatch
 from tensordict.utils import NestedKey
-from torch import Tensor, nn
+from torch import Tensor
 from torchrl.objectives.common import LossModule
 
 from torchrl_tsallis._checks import check_choice, check_flag, check_number, shown
 from torchrl_tsallis.objectives.asking import AskedLoss
-from torchrl_tsallis.objectives.inputs import check_key, mask_of
-from torchrl_tsallis.objectives.samples import action_dims, losses_of_samples, plain_inputs, split_far
+from torchrl_tsallis.objectives.inputs import mask_of
+from torchrl_tsallis.objectives.samples import (
+    action_dims,
+    losses_of_samples,
+    means_of_others,
+    plain_inputs,
+    split_far,
+)
+from torchrl_tsallis.objectives.wrapped import WrappedLoss
 from torchrl_tsallis.ratings.base import Evidence, Rated
 from torchrl_tsallis.ratings.batch import Batch, rating_statistics
 from torchrl_tsallis.ratings.normal import MAX_DISTANCE
@@ -26,7 +33,7 @@ from torchrl_tsallis.ratings.running import RunningScale
 _STATISTICS = ("rating_mean", "rating_var", "ess")
 
 
-class RatedLoss(AskedLoss, LossModule):
+class RatedLoss(WrappedLoss, AskedLoss, LossModule):
     r"""Rates every sample of another loss by that loss, relative to a robust running scale.
 
     .. math::
@@ -176,47 +183,6 @@ class RatedLoss(AskedLoss, LossModule):
         """What a further output is called: nothing but the loss itself may be summed up by a trainer."""
         return key.removeprefix("loss_") if isinstance(key, str) else key
 
-    # What belongs to the wrapped loss.
-
-    @property
-    def tensor_keys(self) -> Any:
-        """The wrapped loss's."""
-        return self.loss_module.tensor_keys
-
-    @property
-    def in_keys(self) -> list[NestedKey]:
-        """The wrapped loss's."""
-        return self.loss_module.in_keys
-
-    @in_keys.setter
-    def in_keys(self, values: list[NestedKey]) -> None:
-        self.loss_module.in_keys = values
-
-    @property
-    def _loss_mask_key(self) -> NestedKey | None:
-        return self.loss_module._loss_mask_key
-
-    @_loss_mask_key.setter
-    def _loss_mask_key(self, value: NestedKey | None) -> None:
-        self.loss_module._loss_mask_key = value
-
-    def set_keys(self, **kwargs: NestedKey | None) -> None:
-        """Sets the wrapped loss's keys."""
-        for name, key in kwargs.items():
-            check_key(name, key)
-        self.loss_module.set_keys(**kwargs)
-
-    def reset_parameters_recursive(self) -> None:
-        """Resets the wrapped loss's parameters."""
-        self.loss_module.reset_parameters_recursive()
-
-    def _make_vmap(self) -> None:
-        """There is none."""
-
-    @property
-    def _networks_asked(self) -> list[nn.Module]:
-        return [part for part in self.loss_module.__dict__.values() if isinstance(part, nn.Module)]
-
     def train(self, mode: bool = True) -> RatedLoss:
         """Sets the networks' mode too, as :class:`~torchrl_tsallis.TsallisBCLoss` does."""
         super().train(mode)
@@ -224,8 +190,6 @@ class RatedLoss(AskedLoss, LossModule):
             for network in self._networks_asked:
                 network.train(mode)
         return self
-
-    # Rating.
 
     def batch_of(self, mask: Tensor | None, sync: bool = True) -> Batch:
         """What a mean over a batch with a mask ``[*B]`` means: of all processes if ``sync``."""
@@ -279,27 +243,12 @@ class RatedLoss(AskedLoss, LossModule):
         self.remember(rated.evidence, batch)
         out = {self.loss_key: loss}
         with torch.no_grad():
-            out |= rated.logged | rating_statistics(rated.weight, batch) | self._others(evidence)
+            out |= (
+                rated.logged
+                | rating_statistics(rated.weight, batch)
+                | means_of_others(evidence, self.loss_key, self._name)
+            )
         return TensorDict(out, [])
-
-    def _others(self, evidence: Evidence) -> dict[NestedKey, Tensor]:
-        """Means of the wrapped loss's further outputs."""
-        out, shape = {}, evidence.likelihood.shape
-        for key, value in evidence.written.items(True, True):
-            if key == self.loss_key:
-                continue
-            if isinstance(key, str) and key.startswith("loss") and value.requires_grad:
-                raise ValueError(
-                    f"the loss is {self.loss_key!r}, but {key!r} has a gradient too: RatedLoss minimises one output, "
-                    "which has to be the sum of all terms"
-                )
-            value = value.detach().to(evidence.likelihood.dtype)
-            if value.shape[: len(shape)] == shape:
-                rest = value.flatten(len(shape)).mean(-1) if value.ndim > len(shape) else value
-                (out[self._name(key)],) = evidence.batch.mean(rest)
-            else:
-                out[self._name(key)] = value.mean()
-        return out
 
     def rating(
         self, tensordict: TensorDictBase, chunk_size: int | None = None, *, draws: int | None = None, seed: int = 0

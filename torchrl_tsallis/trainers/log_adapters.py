@@ -39,7 +39,8 @@ class TensorboardAdapter(LogAdapter):
 
     def table(self, name: str, columns: list[str], rows: list[list[Any]]) -> None:
         """Logs rows as a table of Markdown."""
-        lines = [columns, ["---"] * len(columns), *([str(value) for value in row] for row in rows)]
+        cells = [[" ".join(str(value).split()).replace("|", "\\|") for value in row] for row in (columns, *rows)]
+        lines = [cells[0], ["---"] * len(columns), *cells[1:]]
         self.logger.experiment.add_text(name, "\n".join("|" + "|".join(line) + "|" for line in lines))
 
     def video(self, name: str, path: Path, step: int | None) -> None:

@@ -22,7 +22,7 @@ def _role(key: str) -> str:
     return "observation" if root == "observations" else _ROLES.get(root, "other")
 
 
-def _data_folder(path: Path) -> Path | None:
+def data_folder(path: Path) -> Path | None:
     """The folder ``data`` of a data set that is given by its own folder, by ``data``, or by the HDF5 file in it."""
     folder = path.parent if path.name == "main_data.hdf5" else path
     for candidate in (folder / "data", folder):
@@ -53,7 +53,7 @@ class MinariReader(Reader):
     @classmethod
     def sniff(cls, path: Path) -> bool:
         """Whether the path is a data set's folder, its ``data``, or a HDF5 file with groups ``episode_<i>``."""
-        if _data_folder(path) is not None:
+        if data_folder(path) is not None:
             return True
         if not is_hdf5(path):
             return False
@@ -65,7 +65,7 @@ class MinariReader(Reader):
 
     def __init__(self, path: Path, options: Options) -> None:
         super().__init__(path, options)
-        folder = _data_folder(path)
+        folder = data_folder(path)
         self._metadata = self._read_metadata(folder)
         if folder is None or (folder / "main_data.hdf5").exists():
             self._source: _Hdf5 | _Arrow = _Hdf5(path if folder is None else folder / "main_data.hdf5")
