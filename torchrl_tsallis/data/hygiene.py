@@ -139,8 +139,10 @@ def _check_tensor(name: str, value: Any, size: int | None) -> None:
         raise TypeError(f"{name} must be {wanted}, got {shown(value)}")
     if number:
         check_number(name, value)
-    elif bool(value.isnan().any()) or (tensor and size is not None and value.numel() != size):
-        raise ValueError(f"{name} must have a number for each{' row' if size else ''}, none NaN, got {shown(value)}")
+    elif bool(value.isnan().any()):
+        raise ValueError(f"{name} must have no NaN, got {shown(value)}")
+    elif size is not None and value.numel() != size:
+        raise ValueError(f"{value.numel()} {name} for {size} rows: give one a row")
 
 
 def inspect_demonstrations(

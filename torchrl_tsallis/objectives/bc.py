@@ -13,12 +13,8 @@ from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor
 from torchrl.objectives.common import LossModule
 
-<<<<<<< HEAD
 from torchrl_tsallis._checks import check_choice, check_flag
-from torchrl_tsallis.objectives.actor import get_dist, get_stacked_dist, log_prob_of, own_parameters
-=======
 from torchrl_tsallis.objectives.actor import own_parameters
->>>>>>> main
 from torchrl_tsallis.objectives.asking import AskedLoss
 from torchrl_tsallis.objectives.inputs import check_actors, check_key
 from torchrl_tsallis.objectives.passes import ActorPasses

@@ -15,7 +15,7 @@ from torchrl.objectives.common import LossModule
 
 from torchrl_tsallis._checks import check_choice, check_flag, check_number, shown
 from torchrl_tsallis.objectives.asking import AskedLoss
-from torchrl_tsallis.objectives.inputs import mask_of
+from torchrl_tsallis.objectives.inputs import check_key, mask_of
 from torchrl_tsallis.objectives.samples import (
     action_dims,
     losses_of_samples,
@@ -103,6 +103,7 @@ class RatedLoss(WrappedLoss, AskedLoss, LossModule):
 
     Examples:
         >>> from tensordict.nn import TensorDictModule
+        >>> from torch import nn
         >>> from torchrl.objectives import BCLoss
         >>> actor = TensorDictModule(nn.Linear(3, 2), in_keys=["observation"], out_keys=["action"])
         >>> loss = RatedLoss(BCLoss(actor, loss_function="l2", reduction="none"))
@@ -144,7 +145,7 @@ class RatedLoss(WrappedLoss, AskedLoss, LossModule):
                 f"{kind}(..., reduction='none')"
             )
         if not isinstance(rating, PeakRating | None):
-            raise TypeError(f"rating must be a PeakRating, got {shown(rating)}")
+            raise TypeError(f"RatedLoss takes a PeakRating as rating, got {shown(rating)}")
         if reduction is not None:
             check_choice("reduction", reduction, ("mean", "sum", "none"))
         self.loss_module = loss_module

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchrl_tsallis._checks import check_number, shown
+from torchrl_tsallis._checks import shown
 from torchrl_tsallis.ratings.base import Evidence, Rated, Rating, as_numbers
 from torchrl_tsallis.ratings.running import RunningMean
 from torchrl_tsallis.ratings.tsallis.equations import adaptive_gamma, bound_ratio, log_mixture, rated_value, rating
@@ -73,8 +73,7 @@ class TsallisRating(Rating):
         beta: float | Sequence[float] = 0.0,
     ) -> None:
         super().__init__(beta)
-        gamma_min = check_number("gamma_min", gamma_min, low=0, high=1)
-        gamma_max = check_number("gamma_max", gamma_max, low=0, high=1)
+        gamma_min, gamma_max = _bound("gamma_min", gamma_min), _bound("gamma_max", gamma_max)
         if not 0 < gamma_min <= gamma_max < 1:
             raise ValueError(f"0 < gamma_min <= gamma_max < 1 is needed, got {gamma_min=} and {gamma_max=}")
         self.add_setting("q", q, 0, 1)
@@ -158,6 +157,14 @@ class TsallisRating(Rating):
             value, weight = rated_value(log_prob, self.log_reference(evidence, gamma), q)
             logged = {"q": self.q.clone(), "gamma_mix": gamma, "bound": bound_ratio(moment, gamma=gamma)}
         return Rated(evidence.loss(value, weight), weight, log_prob, logged)
+
+
+def _bound(name: str, value: Any) -> float:
+    """A bound of the adaptive level: one number for all members."""
+    number = as_numbers(name, value, 0, 1)
+    if isinstance(number, list):
+        raise ValueError(f"{name} must be one number in [0, 1] for all members, got {shown(value)}")
+    return number
 
 
 def _levels(gamma_mix: Any, bound: float) -> Any:
