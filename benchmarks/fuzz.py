@@ -46,6 +46,7 @@ ALSO = {
     "actor_network": ("actor",),
     "path": ("file", "cannot write", "cannot read"),
     "kind": ("logger",),
+    "size": ("width", "height"),
     "mean": ("observation_mean", "observation_std"),
 }
 

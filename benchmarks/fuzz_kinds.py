@@ -34,7 +34,7 @@ def number(name: str, low: float = 0, high: float = math.inf) -> Allowed:
 
     def allowed(value: Any) -> bool:
         value = plain(value)
-        if not isinstance(value, Real) or isinstance(value, bool) or math.isnan(value):
+        if not isinstance(value, Real) or isinstance(value, bool) or value != value:
             return False
         try:
             finite = math.isfinite(float(value))

@@ -52,7 +52,7 @@ class RecurrentMeanPolicy:
         for name, part, size in (("head", head, 2), *((f"layers[{i}]", layer, 3) for i, layer in enumerate(layers))):
             if not isinstance(part, (list, tuple)) or len(part) != size:
                 raise TypeError(f"{name} must be a tuple of {size} arrays, got {shown(part)}")
-        self.action_unit = np.float32(check_number("action_unit", action_unit, above=0))
+        self.action_unit = np.float32(check_number("action_unit", action_unit))
         self.layers, width = [], len(np.atleast_1d(self.mean))
         _check_shape("observation_mean", self.mean, (width,))
         _check_shape("observation_std", self.std, (width,))

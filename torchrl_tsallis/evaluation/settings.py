@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import numbers
-import sys
 from typing import Any
 
 from torchrl_tsallis._checks import shown
@@ -55,6 +54,10 @@ def positive_number(name: str, value: Any) -> float:
         ValueError: fps must be a positive number, got fps=nan
     """
     good = isinstance(value, numbers.Real) and not isinstance(value, bool)
-    if not good or not 0 < value < math.inf or value > sys.float_info.max:
+    try:
+        number = float(value) if good else math.nan
+    except OverflowError:  # an integer beyond the floats
+        number = math.inf
+    if not 0 < number < math.inf:
         raise ValueError(f"{name} must be a positive number, got {name}={shown(value)}")
-    return float(value)
+    return number

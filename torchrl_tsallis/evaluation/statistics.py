@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from torchrl_tsallis._checks import check_callable, check_number, check_seed, shown
+from torchrl_tsallis.evaluation.settings import whole_number
 
 
 def _checked(values: ArrayLike, name: str) -> np.ndarray:
@@ -30,7 +31,7 @@ def _checked(values: ArrayLike, name: str) -> np.ndarray:
 
 def _check_bootstrap(confidence: float, resamples: int, seed: int) -> None:
     check_number("confidence", confidence, above=0, below=1)
-    check_number("resamples", resamples, low=1, integer=True)
+    whole_number("resamples", resamples, 1)
     check_seed("seed", seed, low=0)
 
 

@@ -77,7 +77,7 @@ def record_rollout(
     if size is not None:
         if not isinstance(size, (tuple, list)) or len(size) != 2:
             raise ValueError(f"size must be (width, height) in pixels, got {shown(size)}")
-        size = whole_number("size[0]", size[0], 16), whole_number("size[1]", size[1], 16)
+        size = whole_number("width", size[0], 16), whole_number("height", size[1], 16)
     if importlib.util.find_spec(module) is None:
         raise ImportError(f"writing {target.suffix} needs {package}: pip install {package}")
     own = as_policy("policy", policy)

@@ -157,7 +157,8 @@ class RatedLoss(WrappedLoss, AskedLoss, LossModule):
         self.reduction = reduction or "mean"
         self.sync_stats = check_flag("sync_stats", sync_stats)
         self.process_group = process_group
-        self.loss_key = self._only_loss() if loss_key is None else self._checked_loss(loss_key)
+        check_key("loss_key", loss_key)
+        self.loss_key = self._only_loss() if loss_key is None else loss_key
         others = [self._name(key) for key in loss_module.out_keys if key != self.loss_key]
         self.out_keys = [self.loss_key, *self.rating_module.logged, *_STATISTICS, *others]
 
@@ -169,15 +170,6 @@ class RatedLoss(WrappedLoss, AskedLoss, LossModule):
                 "loss_key= which of them is minimised"
             )
         return losses[0]
-
-    def _checked_loss(self, key: NestedKey) -> NestedKey:
-        check_key("loss_key", key)
-        if key not in self.loss_module.out_keys:
-            raise ValueError(
-                f"loss_key must be one of what {type(self.loss_module).__name__} returns, "
-                f"{list(self.loss_module.out_keys)}, got {key!r}"
-            )
-        return key
 
     @staticmethod
     def _name(key: NestedKey) -> NestedKey:
