@@ -17,6 +17,7 @@ import io
 import json
 import logging
 import os
+import signal
 import sys
 import tempfile
 import traceback
@@ -32,13 +33,15 @@ sys.path.insert(0, str(Path(__file__).parent))
 import torch
 from fuzz_inputs import consumers, mutations
 from fuzz_kinds import values
-from fuzz_table import Reached, Subject, subjects
+from fuzz_table import Reached, Subject, every_subject, subjects
 from hypothesis import HealthCheck, Phase, given, seed, settings
 
 import torchrl_tsallis
 
 ROOT = Path(torchrl_tsallis.__file__).parent
 RECIPES = ROOT.parent / "recipes"
+__all__ = ["every_subject", "everything", "fuzz_argument", "fuzz_input", "judged", "subjects"]
+
 #: What messages may call an argument, beside its name.
 ALSO = {
     "demonstrations": ("demonstrations", "trajector"),
@@ -46,6 +49,8 @@ ALSO = {
     "actor_network": ("actor",),
     "path": ("file", "cannot write", "cannot read"),
     "kind": ("logger",),
+    "keys": ("the demonstrations have no",),
+    "policies": ("policy",),
     "size": ("width", "height"),
     "mean": ("observation_mean", "observation_std"),
 }
@@ -103,6 +108,26 @@ def quiet() -> Iterator[None]:
             torch.set_rng_state(state)
 
 
+class Hung(BaseException):
+    """Raised in a call that does not come to an end."""
+
+
+@contextlib.contextmanager
+def ended(seconds: int = 10) -> Iterator[None]:
+    """Ends what takes longer, which counts as an error of another one's."""
+
+    def end(*_: Any) -> None:
+        raise Hung(f"took more than {seconds} s")
+
+    before = signal.signal(signal.SIGALRM, end)
+    signal.alarm(seconds)
+    try:
+        yield
+    finally:
+        signal.alarm(0)
+        signal.signal(signal.SIGALRM, before)
+
+
 def call(subject: Subject, arguments: dict[str, Any]) -> None:
     """Calls; an ``__init__`` on an object that is made for it."""
     if subject.make.__name__ == "__init__":
@@ -135,12 +160,15 @@ def fuzz_argument(subject: Subject, argument: str, examples: int) -> tuple[int, 
         count += 1
         text = shown(value)
         try:
-            call(subject, {**subject.valid(), argument: value})
+            with ended():
+                call(subject, {**subject.valid(), argument: value})
         except BaseException as error:
             if reached(error):
                 if not allowed(value):
                     faults.append(Fault(subject.name, argument, "accepted", text, ""))
                 return
+            if callable(value) and allowed(value):
+                return  # what an own function raises is its own matter
             kind = judged(error, (argument, *ALSO.get(argument, ())))
             if kind:
                 faults.append(Fault(subject.name, argument, kind, text, f"{type(error).__name__}: {error}"[:150]))
@@ -165,7 +193,8 @@ def fuzz_input(name: str, consume: Any, examples: int) -> tuple[int, list[Fault]
         nonlocal count
         count += 1
         try:
-            consume(spoilt.data)
+            with ended():
+                consume(spoilt.data)
         except BaseException as error:
             kind = judged(error, spoilt.names)
             if kind:

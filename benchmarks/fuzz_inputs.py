@@ -52,6 +52,12 @@ _WHOLES: dict[str, Callable[[TensorDict], Any]] = {
 }
 
 
+#: Consumers in which the data reaches a network, whose own errors about it pass.
+NETWORKS = tuple(
+    f"data of {name}" for name in ("TsallisBCLoss", "TsallisBCLoss.rating", "PredictiveBCLoss", "RatedLoss")
+)
+
+
 class Spoilt(NamedTuple):
     """Data, what was done to it, and the names of which a message has to have one."""
 
@@ -74,7 +80,17 @@ def _entry(key: Any, how: str) -> Spoilt:
 
 def mutations() -> st.SearchStrategy[Spoilt]:
     """Demonstrations of which one entry, or the whole, is spoilt."""
-    names = ("demonstrations", "samples", "tensordict", "batch", "experts", "amateur", "observation", "action")
+    names = (
+        "demonstrations",
+        "samples",
+        "tensordict",
+        "batch",
+        "experts",
+        "amateur",
+        "observation",
+        "action",
+        "episode",
+    )
     wholes = st.sampled_from(list(_WHOLES)).map(lambda how: Spoilt(_WHOLES[how](rows()), how, (*names, "trajector")))
     return st.one_of(st.builds(_entry, st.sampled_from(_KEYS), st.sampled_from(list(_VALUES))), wholes)
 

@@ -18,7 +18,7 @@ from torch import Tensor, nn
 Allowed = Callable[[Any], bool]
 
 #: Arguments of type float that may be negative, or infinite.
-SIGNED = {"mean", "low", "high", "target_entropy"}
+SIGNED = {"mean", "turned", "low", "high", "target_entropy"}
 INFINITE = {"k", "ini_dof"}
 
 

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from fuzz_kinds import Allowed, anything, flag, key, kind_of, number, several
+from fuzz_kinds import Allowed, anything, flag, key, kind_of, number, several, whole
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torch import nn
@@ -131,7 +131,7 @@ def _numpy_policy() -> Any:
     return ttd.load_policy("amateur")
 
 
-def _subjects() -> Iterator[tuple[str, Callable[[], Subject]]]:
+def every_subject() -> Iterator[tuple[str, Callable[[], Subject]]]:
     """All of them, made late: a name that a version of the package does not have is left out."""
 
     def of(name: str, get: Callable[[], Any], valid: Callable[[], dict[str, Any]] = dict, **rest: Any) -> Any:
@@ -152,7 +152,7 @@ def _subjects() -> Iterator[tuple[str, Callable[[], Subject]]]:
         "AdaTerm",
         lambda: tt.AdaTerm,
         lambda: {"params": [nn.Parameter(torch.zeros(2, 3))]},
-        kinds={"betas": several(number("beta", 0, 1))},
+        kinds={"betas": several(number("beta", 0, 1)), "batch_dims": _dims},
     )
     yield of("make_policy", lambda: ttm.make_policy, lambda: {"obs_dim": 3, "action_dim": 2})
     yield of(
@@ -341,6 +341,11 @@ def _subjects() -> Iterator[tuple[str, Callable[[], Subject]]]:
     )
 
 
+def _dims(value: Any) -> bool:
+    """Whether there are members is a number of dimensions too."""
+    return flag(value) or whole("batch_dims")(value)
+
+
 def _module(name: str) -> Any:
     return __import__(name, fromlist=["_"])
 
@@ -361,12 +366,12 @@ def named_loss(value: Any) -> bool:
 
 
 def _floats(value: Any) -> bool:
-    """Whether these are finite numbers, at least one."""
+    """Whether these are numbers, at least one and none NaN."""
     try:
         found = np.asarray(value, dtype=np.float64)
     except (TypeError, ValueError, OverflowError, RuntimeError):
         return False
-    return found.size > 0 and bool(np.isfinite(found).all()) and not isinstance(value, (str, bytes))
+    return found.size > 0 and not bool(np.isnan(found).any()) and not isinstance(value, (str, bytes))
 
 
 def _keys(value: Any) -> bool:
@@ -404,7 +409,7 @@ def _recurrent_parts() -> dict[str, Any]:
 def subjects() -> list[Subject]:
     """Those that this version of the package has."""
     found = []
-    for _, make in _subjects():
+    for _, make in every_subject():
         try:
             found.append(make())
         except (AttributeError, ImportError):

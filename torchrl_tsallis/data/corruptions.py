@@ -33,14 +33,20 @@ def _rows_with(data: TensorDictBase, name: str, key: NestedKey) -> Tensor:
     return leaves(data, [key])[key]
 
 
-def _check_alike(experts: TensorDictBase, others: TensorDictBase, name: str) -> None:
+def _layout(data: TensorDictBase, dtypes: bool) -> dict[NestedKey, str]:
+    """Shape, and perhaps dtype, of each entry's rows."""
+    found = {key: value for key, value in data.items(True, True) if isinstance(value, Tensor)}
+    return {key: f"{list(x.shape[1:])}{f' of {x.dtype}' * dtypes}" for key, x in found.items()}
+
+
+def _check_alike(experts: TensorDictBase, others: TensorDictBase, name: str, *, dtypes: bool = False) -> None:
     """Raises for rows of another layout, which cannot stand in the experts' place."""
-    for key, value in experts.items(True, True):
-        other = others.get(key, None)
-        if type(other) is not type(value) or (isinstance(value, Tensor) and other.shape[1:] != value.shape[1:]):
-            found = "missing" if other is None else f"of shape {list(getattr(other, 'shape', []))}"
+    own, other = _layout(experts, dtypes), _layout(others, dtypes)
+    for key in own.keys() | other.keys():
+        if own.get(key) != other.get(key):
             raise ValueError(
-                f"{key!r} of the demonstrations is {found} in {name}: both need the same entries and shapes"
+                f"{key!r} of the demonstrations is {own.get(key, 'missing')} in experts and "
+                f"{other.get(key, 'missing')} in {name}: both need the same entries"
             )
 
 
@@ -69,11 +75,11 @@ def add_action_noise(
         True
     """
     probability = check_number("probability", probability, low=0, high=1)
-    mean = check_number("mean", mean, low=-LARGEST, high=LARGEST)
-    scale = check_number("scale", scale, low=0, high=LARGEST)
+    mean = float(check_number("mean", mean, low=-LARGEST, high=LARGEST))
+    scale = float(check_number("scale", scale, low=0, high=LARGEST))
     generator = torch.Generator().manual_seed(check_seed("seed", seed))
     action = _rows_with(demonstrations, "demonstrations", "action")
-    if not action.is_floating_point() or action.ndim < 2:
+    if not action.is_floating_point() or action.ndim != 2:
         raise TypeError(
             f"'action' is {action.dtype} of shape {list(action.shape)}: noise needs vectors of real numbers"
         )
@@ -121,6 +127,8 @@ def replace_with_amateur(
                 f"trajectory {numbers[counts > 1][0].item()} of the {name} stands in two runs of rows, and its rows "
                 "would be taken twice: give each trajectory a number of its own under ('info', 'episode')"
             )
+        check_rows(side, [("info", "episode")])
+    check_rows(experts, [("info", "expert")])
     _check_alike(experts, amateur, "amateur")
     generator = torch.Generator().manual_seed(check_seed("seed", seed))
     spare = amateur["info", "episode"].unique().tolist()
@@ -183,8 +191,8 @@ def make_task(
     if not isinstance(task, str) or task not in TASKS:
         raise ValueError(f"no task {shown(task)}: choose one of {', '.join(TASKS)}")
     probability = check_number("probability", probability, low=0, high=1)
-    mean = check_number("mean", mean, low=-LARGEST, high=LARGEST)
-    scale, seed = check_number("scale", scale, low=0, high=LARGEST), check_seed("seed", seed)
+    mean = float(check_number("mean", mean, low=-LARGEST, high=LARGEST))
+    scale, seed = float(check_number("scale", scale, low=0, high=LARGEST)), check_seed("seed", seed)
     artificial, with_amateur = TASKS[task]
     out = replace_with_amateur(experts, amateur, seed=seed) if with_amateur else experts.clone()
     if artificial:
@@ -220,7 +228,8 @@ def replace_pairs(experts: TensorDictBase, others: TensorDictBase, *, share: flo
     generator = torch.Generator().manual_seed(check_seed("seed", seed))
     _rows_with(experts, "experts", ("info", "is_amateur"))
     check_rows(others, ["action"])
-    _check_alike(experts.exclude("info"), others, "others")
+    pairs = experts.exclude("info")
+    _check_alike(pairs, others.select(*pairs.keys(), strict=False), "others", dtypes=True)
     hit = torch.rand(experts.shape, generator=generator) < share
     drawn = torch.randint(len(others), (int(hit.sum()),), generator=generator)
     out = experts.clone()

@@ -60,6 +60,8 @@ def record_trajectory(
     length = int(check_number("length", length, low=1, integer=True))
     tries = int(check_number("tries", tries, low=1, integer=True))
     env = make_env()
+    if not hasattr(env, "reset"):
+        raise TypeError(f"make_env must make an environment of gymnasium, it made {shown(env)}")
     env.reset(seed=seed)  # the first episode of a fresh PyBullet environment starts unlike all later ones
     for attempt in range(tries):
         rng = np.random.default_rng([seed, attempt])
@@ -196,7 +198,7 @@ def validate_demonstrations(demonstrations: TensorDictBase, *, action_limit: flo
         >>> validate_demonstrations(TensorDict({"observation": torch.rand(3, 2), "action": torch.rand(3, 1)}, [3]))
     """
     if action_limit is not None:
-        action_limit = check_number("action_limit", action_limit, above=0)
+        action_limit = float(check_number("action_limit", action_limit, above=0))
     check_pairs(demonstrations, action_limit=action_limit)
     if has_episodes(demonstrations):
         find_episodes(demonstrations, open_end=True)

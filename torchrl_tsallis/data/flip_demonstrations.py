@@ -67,6 +67,8 @@ def record_flips(
     check_callable("make_env", make_env, "makes the environment")
     seed, steps = check_seed("seed", seed, low=0), int(check_number("steps", steps, low=1, integer=True))
     env = make_env()
+    if not hasattr(env, "reset"):
+        raise TypeError(f"make_env must make an environment of gymnasium, it made {shown(env)}")
     observation, info = env.reset(seed=seed)
     operator = FlipOperator(seed, style)
     rows: list[tuple[np.ndarray, ...]] = []
@@ -115,6 +117,8 @@ def replay_forces(make_env: Callable[[], Any], forces: torch.Tensor, *, seed: in
     if not isinstance(forces, torch.Tensor) or forces.ndim != 2:
         raise TypeError(f"forces must be a tensor [T, 3], got {shown(forces)}")
     env = make_env()
+    if not hasattr(env, "reset"):
+        raise TypeError(f"make_env must make an environment of gymnasium, it made {shown(env)}")
     _, info = env.reset(seed=check_seed("seed", seed, low=0))
     angles, observations = [info["edge_angles"]], []
     for force in forces.numpy():

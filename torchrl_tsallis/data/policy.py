@@ -115,7 +115,7 @@ class NumpyPolicy:
                 "of another network"
             )
         self.tensors = {name: as_weights(name, tensors[name]) for name in _NAMES}
-        self.metadata = dict(metadata or {})
+        self.metadata = {} if metadata is None else dict(metadata)
         if self.tensors["w1"].ndim != 2:
             raise ValueError(f"w1 of shape {list(self.tensors['w1'].shape)} must be a matrix [obs_dim, H]")
         width = self.tensors["w1"].shape[0]

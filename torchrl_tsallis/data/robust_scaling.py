@@ -155,9 +155,10 @@ class RobustScaling:
     def __init__(self, centres: Mapping[NestedKey, Tensor], scales: Mapping[NestedKey, Tensor]) -> None:
         for what, given in (("centres", centres), ("scales", scales)):
             if not isinstance(given, Mapping) or not all(
-                isinstance(value, Tensor) and value.is_floating_point() for value in given.values()
+                isinstance(value, Tensor) and value.is_floating_point() for value in dict(given.items()).values()
             ):
                 raise TypeError(f"{what} must be a mapping, key -> tensor [D] of real numbers, got {shown(given)}")
+        centres, scales = dict(centres.items()), dict(scales.items())
         if centres.keys() != scales.keys():
             raise ValueError(f"centres of {list(centres)} and scales of {list(scales)}: give both for each key")
         for key, scale in scales.items():

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from torchrl_tsallis._checks import check_number, shown
 from torchrl_tsallis.data.rows import PIECE, map_rows, pieces, row_bytes
-from torchrl_tsallis.data.schema import check_layout, leaves
+from torchrl_tsallis.data.schema import bad_rows, leaves
 
 #: A spread below so many float32 roundings of the values themselves is no signal.
 ROUNDINGS = 64 * torch.finfo(torch.float32).eps
@@ -70,13 +70,16 @@ class Scaling:
             ValueError: if the unit is not positive and finite, or the observation is no vector.
         """
         action_unit = check_number("action_unit", action_unit, above=0)
-        check_layout(demonstrations)
+        if not isinstance(demonstrations, TensorDictBase) or not demonstrations.ndim or 0 in demonstrations.shape:
+            raise ValueError(f"demonstrations must be a TensorDict of at least one row, got {shown(demonstrations)}")
         found = leaves(demonstrations, ["observation"])
         if list(found) != ["observation"]:
             raise TypeError(f"'observation' is nested, {list(found)}: use RobustScaling, or concatenate the vectors")
         observation = found["observation"]
         if observation.ndim <= demonstrations.ndim:
             raise ValueError(f"'observation' has shape {list(observation.shape)}, needed is a vector a row: [N, O]")
+        if bad_rows(observation.flatten(0, -2))[0]:
+            raise ValueError("'observation' is NaN or infinite in some rows: validate_demonstrations names them")
         mean, std = _moments(observation.flatten(0, -2))
         floor = torch.maximum(1e-9 * (1 + mean.abs()), ROUNDINGS * mean.abs())
         return cls(mean.float(), std.where(std > floor, 1.0).float(), float(action_unit))

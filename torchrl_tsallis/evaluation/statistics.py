@@ -29,10 +29,11 @@ def _checked(values: ArrayLike, name: str) -> np.ndarray:
     return array
 
 
-def _check_bootstrap(confidence: float, resamples: int, seed: int) -> None:
+def _checked_seed(confidence: float, resamples: int, seed: int) -> int:
+    """The seed of a bootstrap, all of whose settings are checked."""
     check_number("confidence", confidence, above=0, below=1)
     whole_number("resamples", resamples, 1)
-    check_seed("seed", seed, low=0)
+    return check_seed("seed", seed, low=0)
 
 
 def median(values: ArrayLike) -> float:
@@ -99,7 +100,7 @@ def bootstrap_interval(
         {'value': 1.0, 'low': 1.0, 'high': 1.0, 'unit': 'seed', 'n': 2}
     """
     array = _checked(scores, "scores")
-    _check_bootstrap(confidence, resamples, seed)
+    seed = _checked_seed(confidence, resamples, seed)
     check_callable("statistic", statistic, "makes a number of an array")
     if not 1 <= array.ndim <= 3:
         raise ValueError(f"need scores [S], [S, E] or [T, S, E], got {array.shape}")
@@ -190,7 +191,7 @@ def improvement_interval(
         {'value': 1.0, 'low': 1.0, 'high': 1.0}
     """
     a, b = np.atleast_2d(_checked(x, "x")), np.atleast_2d(_checked(y, "y"))
-    _check_bootstrap(confidence, resamples, seed)
+    seed = _checked_seed(confidence, resamples, seed)
     if a.ndim != 2 or b.ndim != 2 or len(a) != len(b):
         raise ValueError(f"x and y must be [S] or [T, S] of as many tasks, got {a.shape} and {b.shape}")
     wins = (a[:, :, None] > b[:, None]) + 0.5 * (a[:, :, None] == b[:, None])  # [T, S, S']

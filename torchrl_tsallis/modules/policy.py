@@ -90,7 +90,7 @@ def make_policy(
         >>> make_policy(28, 8)(TensorDict({"observation": torch.zeros(3, 28)}, [3]))["action"].shape
         torch.Size([3, 8])
     """
-    if isinstance(hidden, str) or not isinstance(hidden, Sequence):
+    if isinstance(hidden, (str, bytes)) or not isinstance(hidden, Sequence):
         raise TypeError(f"hidden must be a sequence of widths, one a hidden layer, got {shown(hidden)}")
     check_dims(obs_dim=obs_dim, **{f"hidden[{i}]": n for i, n in enumerate(hidden)}, action_dim=action_dim)
     sizes = [int(n) for n in (obs_dim, *hidden)]
