@@ -14,9 +14,11 @@ from __future__ import annotations
 import argparse
 import contextlib
 import io
+import itertools
 import json
 import logging
 import os
+import shutil
 import signal
 import sys
 import tempfile
@@ -30,6 +32,7 @@ from zlib import crc32
 
 sys.path.insert(0, str(Path(__file__).parent))
 
+import fuzz_recipes
 import torch
 from fuzz_inputs import consumers, mutations
 from fuzz_kinds import values
@@ -205,6 +208,63 @@ def fuzz_input(name: str, consume: Any, examples: int) -> tuple[int, list[Fault]
     return count, faults
 
 
+def fuzz_option(recipe: str, option: str, examples: int, loaded: Any = None) -> tuple[int, list[Fault]]:
+    """Starts a recipe with many values of one option; the number of starts, and the faults."""
+    from omegaconf import OmegaConf
+    from omegaconf.errors import OmegaConfBaseException
+
+    run, cfg, patches = loaded or fuzz_recipes.load(RECIPES, recipe)
+    before, faults, count = OmegaConf.select(cfg, option), [], 0
+
+    @seed(crc32(f"{recipe}.{option}".encode()))
+    @settings(max_examples=examples, database=None, deadline=None, phases=[Phase.generate],
+              suppress_health_check=list(HealthCheck))  # fmt: skip
+    @given(fuzz_recipes.values())
+    def one(value: Any) -> None:
+        nonlocal count
+        own = cfg.copy()
+        try:
+            OmegaConf.update(own, option, value, merge=False)
+        except (OmegaConfBaseException, ValueError, OverflowError):
+            return  # Hydra's own check of a type
+        value = OmegaConf.select(own, option)  # as it has converted it
+        shutil.rmtree("outputs", ignore_errors=True)
+        count += 1
+        error: BaseException | None = None
+        with contextlib.ExitStack() as stack:
+            for patch in patches:
+                stack.enter_context(patch)
+            try:
+                with ended():
+                    run(own)
+            except BaseException as caught:
+                error = caught
+        if error is None or reached(error):
+            if not fuzz_recipes.allowed(option, before, value):
+                faults.append(Fault(recipe, option, "accepted", shown(value), ""))
+            return
+        kind = (
+            judged(error, (option, *option.split(".")[-1:], *option.split(".")[-1].removesuffix("_key").split()))
+            if isinstance(error, SystemExit)
+            else "raw"
+        )
+        if kind:
+            faults.append(Fault(recipe, option, kind, shown(value), f"{type(error).__name__}: {error}"[:150]))
+
+    with quiet():
+        one()
+    return count, faults
+
+
+def all_options(examples: int, chosen: str = "") -> Iterator[tuple[str, str, int, list[Fault]]]:
+    """All options of all recipes."""
+    for recipe in fuzz_recipes.RECIPES:
+        if chosen in recipe:
+            loaded = fuzz_recipes.load(RECIPES, recipe)
+            for option in fuzz_recipes.leaves(loaded[1]):
+                yield (f"recipe {recipe}", option, *fuzz_option(recipe, option, examples, loaded))
+
+
 def everything(examples: int, chosen: str = "") -> Iterator[tuple[str, str, int, list[Fault]]]:
     """All subjects, argument by argument, and all consumers of data."""
     for subject in subjects():
@@ -222,11 +282,15 @@ def main() -> None:
     parser.add_argument("--examples", type=int, default=50, help="values of an argument")
     parser.add_argument("--only", default="", help="part of the names of what is fuzzed")
     parser.add_argument("--show", action="store_true", help="print one fault of each kind and argument")
-    parser.add_argument("--slow", action="store_true", help="print the arguments that take more than 2 s")
+    parser.add_argument("--recipes", action="store_true", help="the recipes alone")
     parser.add_argument("--json", help="file for the counts by constructor")
     options = parser.parse_args()
     table: dict[str, Counter[str]] = {}
-    for name, argument, calls, faults in everything(options.examples, options.only):
+    found = itertools.chain(
+        [] if options.recipes else everything(options.examples, options.only),
+        all_options(options.examples, options.only),
+    )
+    for name, argument, calls, faults in found:
         row = table.setdefault(name, Counter())
         row["arguments"] += 1
         row["calls"] += calls
