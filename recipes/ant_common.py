@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
+import numpy as np
+import torch
 from collect_ant import collect_dataset
 from common import as_list
 from omegaconf import DictConfig
@@ -44,10 +47,27 @@ def _recorded(cfg: DictConfig, experts: tuple[str, ...], progress: bool) -> tupl
     )
 
 
+def ratings_file(cfg: DictConfig, task: str, std: float, seed: int) -> Path:
+    """Where recipes/curation.py leaves what it knows of a task's demonstrations."""
+    return Path(cfg.output).absolute() / "ratings" / f"std_{std:g}" / task / f"seed_{seed}.npz"
+
+
 def task_data(task: str, cfg: DictConfig, seed: int) -> Any:
-    """The demonstrations of a task, ``[N]``: one of the paper's four, or a conflict with learners pair by pair."""
+    """The demonstrations of a task, ``[N]``: one of the paper's four, or a conflict with learners pair by pair.
+
+    ``both@surprise`` is the task ``both`` without the episodes of largest surprise, ``both@return`` without those of
+    least return; recipes/curation.py has written both down.
+    """
+    task, _, rule = task.partition("@")
     experts, amateur = demonstrations(cfg)
-    if task not in CONFLICTS:
-        return make_task(task, experts, amateur, seed=seed, **cfg.data.noise)
-    others, _ = _recorded(cfg, tuple(cfg.data.learners), False)
-    return replace_pairs(experts, others, share=CONFLICTS[task], seed=seed)
+    if task in CONFLICTS:
+        others, _ = _recorded(cfg, tuple(cfg.data.learners), False)
+        return replace_pairs(experts, others, share=CONFLICTS[task], seed=seed)
+    data = make_task(task, experts, amateur, seed=seed, **cfg.data.noise)
+    if not rule:
+        return data
+    known = np.load(ratings_file(cfg, task, cfg.data.std, seed))
+    worst_first = np.argsort(-known["surprise"] if rule == "surprise" else known["ep_return"], kind="stable")
+    dropped = worst_first[: int(cfg.curated.share * len(worst_first))]
+    number = np.arange(len(data)) // cfg.data.length
+    return data[torch.from_numpy(~np.isin(number, dropped))]

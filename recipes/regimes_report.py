@@ -28,6 +28,8 @@ ORDER = (
     "peak_fixed",
     "beta_only",
 )
+#: Drawn in the map.
+MAP = ("bc", "q_bc_0.95", "peak", "q_bc_0.8", "proposal", "adaptive_gamma", "q_bc_0.6", "peak_fixed")
 LABELS = {
     "bc": "BC",
     "proposal": "proposal",
@@ -126,8 +128,8 @@ def report(rows: Sequence[Mapping[str, Any]], pictures: Path) -> str:
     panels: dict[str, dict[str, dict[float, np.ndarray]]] = {}
     for (trio, task, std, scale), methods in sorted(scores.items()):
         if trio == "own" and scale == 1 and task in ("clean", "both"):
-            for method, returns in methods.items():
-                panels.setdefault(task, {}).setdefault(label_of(method), {})[std] = returns
+            for method in (method for method in MAP if method in methods):
+                panels.setdefault(task, {}).setdefault(label_of(method), {})[std] = methods[method]
     if panels:
         level = "standard deviation of the experts' actions"
         returns_by_level(panels, pictures / "regimes.png", level=level, title="Imitation of the Ant")

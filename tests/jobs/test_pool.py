@@ -132,7 +132,7 @@ def test_workers_end_with_their_parent(end, jobs, tmp_path):
             time.sleep(0.05)
         workers = [int(path.name) for path in folder.iterdir()]
         os.kill(process.pid, end)
-        process.communicate(timeout=60)
+        process.communicate(timeout=300)
         until = time.monotonic() + 60
         while any(alive(pid) for pid in workers) and time.monotonic() < until:
             time.sleep(0.05)

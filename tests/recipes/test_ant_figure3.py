@@ -60,7 +60,7 @@ def test_killed_and_started_again_it_does_everything_once_as_single_runs_do(reci
     while len(lines_of(output / "returns.csv")) < 5 and process.poll() is None and time.monotonic() < deadline:
         time.sleep(0.01)
     process.send_signal(signal.SIGKILL)  # while the first unit's policies are evaluated
-    process.communicate(timeout=60)
+    process.communicate(timeout=300)
     assert process.returncode == -signal.SIGKILL
     before = lines_of(output / "returns.csv")
     assert 4 <= len(before) < 1 + 24

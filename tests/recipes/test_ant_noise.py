@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -22,11 +23,12 @@ METHODS = ("bc", "q_bc", "proposal", "peak")
 
 
 def start(folder: Path, *overrides: str) -> subprocess.Popen:
+    """Starts the recipe; Ctrl-C reaches it even where these tests are run in the background, which ignores it."""
     command = [sys.executable, str(RECIPE), *SMALL, *overrides]
     environment = os.environ | {"COLUMNS": "80"}
     return subprocess.Popen(
         command, cwd=folder, env=environment, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
-        start_new_session=True,
+        start_new_session=True, preexec_fn=partial(signal.signal, signal.SIGINT, signal.default_int_handler),
     )  # fmt: skip
 
 
@@ -83,7 +85,7 @@ def test_an_interrupted_job_goes_on_to_the_same_weights(unbroken, tmp_path, sign
         os.killpg(process.pid, sign)  # as Ctrl-C in a terminal does
     else:
         process.kill()
-    _, err = process.communicate(timeout=60)
+    _, err = process.communicate(timeout=300)
     assert process.returncode == -sign if sign == signal.SIGKILL else "resume=true" in err, err
     assert list(unit.glob("checkpoints/*")) and not (unit / "policy.safetensors").exists()
     assert gone(process.pid), "a worker is left"
@@ -100,7 +102,7 @@ def test_an_interrupted_job_goes_on_to_the_same_weights(unbroken, tmp_path, sign
 
 def test_resuming_with_other_settings_is_refused(unbroken):
     process = start(unbroken[0], "resume=true", "ratings.tsallis.gamma_min=0.2", "evaluation.episodes=3")
-    _, err = process.communicate(timeout=60)
+    _, err = process.communicate(timeout=300)
     assert process.returncode == 1 and "was made with other ratings, evaluation" in err
 
 

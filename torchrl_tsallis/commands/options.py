@@ -1,0 +1,89 @@
+"""Options that several commands have, and how they answer."""
+
+from __future__ import annotations
+
+import json
+import shlex
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import tyro
+
+
+def say(answer: dict[str, Any], text: str, as_json: bool) -> None:
+    """Writes an answer to stdout, as text or as one object of JSON."""
+    sys.stdout.write((json.dumps(answer, default=str) if as_json else text) + "\n")
+
+
+def note(text: str) -> None:
+    """Writes a line to stderr."""
+    sys.stderr.write(f"tsallis: {' '.join(text.split())}\n")
+
+
+def command_line(words: Sequence[str]) -> str:
+    """The command as a shell takes it."""
+    return shlex.join(["tsallis", *words])
+
+
+@dataclass(kw_only=True)
+class Reads:
+    """What is read of a file of demonstrations.
+
+    Args:
+        path: file or folder: Minari, robomimic, LeRobot, TED, npz or CSV.
+        obs: keys of the observation, * for any letters. Default: all vectors that the format calls observations.
+        action: key of the action, or keys of its columns. Default: what the format calls action.
+        episode: key of the episode's number (npz, CSV).
+        format: name of the format. Default: found by looking at the path.
+        filter_key: a mask of robomimic, or a split of LeRobot. Default: all episodes.
+        json: whether to answer with an object of JSON, without a progress bar.
+    """
+
+    path: tyro.conf.Positional[Path]
+    obs: tuple[str, ...] = ()
+    action: tuple[str, ...] = ()
+    episode: str | None = None
+    format: str | None = None
+    filter_key: str | None = None
+    json: bool = False
+
+    def chosen(self) -> dict[str, Any]:
+        """Arguments of :func:`~torchrl_tsallis.run.rate` and :func:`~torchrl_tsallis.run.train`."""
+        action = self.action[0] if len(self.action) == 1 else self.action or None
+        common = {"episode": self.episode, "format": self.format, "filter_key": self.filter_key}
+        return {"obs": self.obs or None, "action": action, **common}
+
+
+@dataclass
+class RateTraining:
+    """How the policies that rate are trained.
+
+    Args:
+        steps: gradient steps. Default: 40 passes, from 1000 to 10,000 steps.
+        seeds: replications, which the intervals are over; at least 2 for a verdict.
+        folds: parts of which one is held out at a time.
+        batch_size: samples a step and policy.
+    """
+
+    steps: int | None = None
+    seeds: int = 3
+    folds: int = 2
+    batch_size: int = 256
+
+
+@dataclass
+class PolicyTraining:
+    """How the policy is trained.
+
+    Args:
+        steps: gradient steps. Default: 40 passes, from 1000 to 10,000 steps.
+        seed: of its first parameters and of the samples' order.
+        batch_size: samples a step.
+    """
+
+    steps: int | None = None
+    seed: int = 0
+    batch_size: int = 256
