@@ -7,15 +7,15 @@ from typing import Any
 
 import numpy as np
 import torch
+
+from torchrl_tsallis.data import RobustScaling
+from torchrl_tsallis.data.episodes import find_episodes
 from torchrl_tsallis.data.signals import episode_signals, knn_residual, mutual_information
+from torchrl_tsallis.evaluation import auroc
 from torchrl_tsallis.run import default_steps
 from torchrl_tsallis.runs.held_out import hold_out
 from torchrl_tsallis.runs.judgement import spearman
 from torchrl_tsallis.runs.members import make_splits, train_members
-
-from torchrl_tsallis.data import RobustScaling
-from torchrl_tsallis.data.episodes import find_episodes
-from torchrl_tsallis.evaluation import auroc
 
 #: Scores of samples, large where one is suspicious.
 SAMPLES = ("surprise", "surprise_seen", "rejection", "knn_residual", "deminf")
