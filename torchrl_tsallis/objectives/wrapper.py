@@ -103,6 +103,7 @@ class RatedLoss(WrappedLoss, AskedLoss, LossModule):
 
     Examples:
         >>> from tensordict.nn import TensorDictModule
+        >>> from torch import nn
         >>> from torchrl.objectives import BCLoss
         >>> actor = TensorDictModule(nn.Linear(3, 2), in_keys=["observation"], out_keys=["action"])
         >>> loss = RatedLoss(BCLoss(actor, loss_function="l2", reduction="none"))
