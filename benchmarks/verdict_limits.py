@@ -70,7 +70,8 @@ def main() -> None:
             agree, stretch = said["agreement"], np.median(said["stretch"])
             print(
                 f"{kind:12} {episodes:8} {steps:5} {obs:3} {act:3} {corrupted:9} {seed:4} {said['usable']!s:>6} "
-                f"{agree['spearman']:5.2f} {agree['reliability']:11.2f} {said['calibration']['1']:6.2f} {stretch:7.2f} {auroc:>5}",
+                f"{agree['spearman']:5.2f} {agree['reliability']:11.2f} {said['calibration']['1']:6.2f} {stretch:7.2f} "
+                f"{auroc:>5}",
                 flush=True,
             )
 

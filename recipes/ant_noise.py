@@ -17,13 +17,12 @@ import time
 from functools import partial
 from itertools import product
 from pathlib import Path
-from typing import Any
 
 import hydra
 import torch
 from ant_common import TRAINING, check_names, demonstrations, task_data
 from ant_report import kinds_of, read_returns, report, save_returns
-from common import as_list, keep_method_settings, make_rating, make_trainer
+from common import as_list, keep_method_settings, make_rating, make_trainer, save_as_run
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 from safetensors.torch import load_file, save_file
@@ -34,9 +33,6 @@ from torchrl_tsallis.data import make_replay_buffer, validate_demonstrations
 from torchrl_tsallis.envs import make_ant
 from torchrl_tsallis.evaluation import MeanPolicy, evaluate_policies, median, record_rollout
 from torchrl_tsallis.jobs import atomic_path, run_jobs, tick
-from torchrl_tsallis.objectives import TsallisBCLoss
-from torchrl_tsallis.runs.saved import save_run
-from torchrl_tsallis.runs.source import identity
 from torchrl_tsallis.trainers import LoggerGroup, make_logger, resume
 
 STEP_SECONDS = 0.0165  # s of the Ant's simulated time
@@ -93,26 +89,9 @@ def train(unit: Unit, cfg: DictConfig) -> None:
     logger.shutdown()
     with atomic_path(folder / "ratings.safetensors") as path:
         save_file({"rating": rating, **kinds_of(data)}, path)
-    save_training(unit, cfg, folder, loss, actor.state_dict(), data)  # last: it marks the training as done
-
-
-def save_training(unit: Unit, cfg: DictConfig, folder: Path, loss: TsallisBCLoss, state: Any, data: Any) -> None:
-    """Leaves a run in the folder that ``torchrl_tsallis.run.Run`` opens: it can act, and rate other data."""
-    task, seed, method = unit
-    sizes = {"obs_dim": data["observation"].shape[1], "action_dim": data["action"].shape[1]}
-    keys = {"observation": ["observation"], "action": ["action"]}
-    about = {"path": "", "format": "memory", "keys": keys, "identity": identity(data), "steps": len(data)}
-    target = loss.target_actor_network_params.data.flatten_keys(".") if loss.needs_target else None
-    save_run(
-        folder,
-        kind="recipe",
-        actor=state,
-        rating=loss.rating_module.state_dict(),
-        arguments={**sizes, "hidden": list(cfg.policy.hidden)},
-        data={**about, "task": task, "std": cfg.data.std},
-        train={"epochs": cfg.epochs, "batch_size": cfg.batch_size, "seed": seed, "lr": cfg.optimizer.lr},
-        command=f"recipes/ant_noise.py task={task} seed={seed} method={method}",
-        target=None if target is None else dict(target.items()),
+    about = {"task": task, "std": cfg.data.std}
+    save_as_run(
+        folder, cfg, loss, actor, data, about=about, seed=seed, command=f"recipes/ant_noise.py {about} {method}"
     )
 
 

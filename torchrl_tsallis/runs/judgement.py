@@ -16,7 +16,8 @@ All of them are conventions: half of a perfect agreement, errors twice as large 
 range about the 10 % that a calibrated surprise has. They ask whether the ratings repeat and fit, not whether they are
 right, and were validated on no real data with known faults. On 16 simulated sets of data (benchmarks/verdict_limits.py)
 they refuse the two whose actions do not depend on the state, and name no episode in the two clean ones; of the twelve
-with corrupted episodes, all of which have these first, they refuse seven for their stretch: they err towards no verdict.
+with corrupted episodes, all of which have these first, they refuse seven for their stretch: they err towards no
+verdict.
 """
 
 from __future__ import annotations
