@@ -1,6 +1,6 @@
 """When `tsallis rate` gives a verdict, on simulated demonstrations of which it is known which episodes are corrupted.
 
-    python benchmarks/verdict_limits.py
+    python benchmarks/verdict_limits.py > docs/results/verdict_limits.txt
 
 Smooth observations, actions that follow from them, and in some episodes random actions instead; 16 ratings, about four
 minutes on one core. One line a set of data: whether the rating says that it is usable, on what that rests, and whether
