@@ -22,7 +22,7 @@ import hydra
 import torch
 from ant_common import TRAINING, check_names, demonstrations, task_data
 from ant_report import kinds_of, read_returns, report, save_returns
-from common import as_list, keep_method_settings, make_rating, make_trainer
+from common import as_list, keep_method_settings, make_rating, make_trainer, save_as_run
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 from options import check_options, check_parts
@@ -90,8 +90,10 @@ def train(unit: Unit, cfg: DictConfig) -> None:
     logger.shutdown()
     with atomic_path(folder / "ratings.safetensors") as path:
         save_file({"rating": rating, **kinds_of(data)}, path)
-    with atomic_path(folder / "policy.safetensors") as path:  # last: it marks the training as done
-        save_file({name: value.contiguous() for name, value in actor.state_dict().items()}, path)
+    about = {"task": task, "std": cfg.data.std}
+    save_as_run(
+        folder, cfg, loss, actor, data, about=about, seed=seed, command=f"recipes/ant_noise.py {about} {method}"
+    )
 
 
 def evaluate(units: list[Unit], cfg: DictConfig) -> None:

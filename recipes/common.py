@@ -13,6 +13,8 @@ from omegaconf import DictConfig, ListConfig, OmegaConf
 from torchrl.trainers import Trainer
 
 from torchrl_tsallis.jobs import atomic_path
+from torchrl_tsallis.runs.saved import save_run
+from torchrl_tsallis.runs.source import identity
 
 
 def as_list(value: Any) -> list[Any]:
@@ -132,3 +134,34 @@ def keep_method_settings(cfg: DictConfig, folders: Mapping[Path, str], names: Se
     for folder, name in folders.items():
         method = every["methods"][name]
         keep_settings(folder / "settings.json", every | method, (*names, *method), "resume=false")
+
+
+def save_as_run(
+    folder: Path, cfg: DictConfig, loss: Any, actor: Any, data: Any, *, about: dict[str, Any], seed: int, command: str
+) -> None:
+    """Leaves a training as a folder that ``torchrl_tsallis.run.Run`` opens; the policy is last, and marks it as done.
+
+    Args:
+        folder: of the training.
+        cfg: of the recipe.
+        loss: trained, of one policy.
+        actor: the policy, of ``make_policy``.
+        data: that it was trained on, ``[N]``.
+        about: what else to say of the data.
+        seed: of the training.
+        command: that made it.
+    """
+    sizes = {"obs_dim": data["observation"].shape[1], "action_dim": data["action"].shape[1]}
+    keys = {"observation": ["observation"], "action": ["action"]}
+    target = loss.target_actor_network_params.data.flatten_keys(".") if loss.needs_target else None
+    save_run(
+        folder,
+        kind="recipe",
+        actor=actor.state_dict(),
+        rating=loss.rating_module.state_dict(),
+        arguments={**sizes, "hidden": list(cfg.policy.hidden)},
+        data={"path": "", "format": "memory", "keys": keys, "identity": identity(data), "steps": len(data), **about},
+        train={"epochs": cfg.epochs, "batch_size": cfg.batch_size, "seed": seed, "lr": cfg.optimizer.lr},
+        command=command,
+        target=None if target is None else dict(target.items()),
+    )

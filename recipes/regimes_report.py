@@ -29,7 +29,7 @@ ORDER = (
     "beta_only",
 )
 #: Drawn in the map.
-MAP = ("bc", "q_bc_0.95", "peak", "q_bc_0.8", "proposal", "adaptive_gamma", "q_bc_0.6", "peak_fixed")
+MAP = ("bc", "q_bc_0.95", "peak", "q_bc_0.8", "proposal", "adaptive_gamma", "q_bc_0.9", "peak_fixed")
 LABELS = {
     "bc": "BC",
     "proposal": "proposal",

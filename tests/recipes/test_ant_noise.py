@@ -11,8 +11,14 @@ import time
 from functools import partial
 from pathlib import Path
 
+import numpy as np
 import pytest
+import torch
 from safetensors.numpy import load_file
+from tensordict import TensorDict
+
+from torchrl_tsallis.evaluation import MeanPolicy
+from torchrl_tsallis.runs import Run
 
 for package in ("hydra", "pybullet", "matplotlib", "tqdm"):
     pytest.importorskip(package)
@@ -68,6 +74,12 @@ def test_one_command_gives_table_returns_pictures_and_a_video(unbroken):
         unit = output / "both" / "seed_0" / method
         assert (unit / "rollout.gif").stat().st_size > 1000
         assert len((unit / "scalars" / "loss_tsallis_bc.csv").read_text().split()) == 80
+        run = Run.open(unit)
+        policy = MeanPolicy.from_actor_state(load_file(unit / "policy.safetensors"))
+        np.testing.assert_allclose(run.numpy_policy()(np.ones(28)), policy(np.ones(28)), rtol=1e-6)
+        assert run.settings["train"]["epochs"] == 80 and len(run.settings["data"]["identity"]) == 64
+        rating = run.rate(TensorDict({"observation": torch.zeros(5, 28), "action": torch.zeros(5, 8)}, [5]))
+        assert rating.shape == (5,) and bool((rating == 1).all()) == (method == "bc")
     assert list(output.rglob("events.out.tfevents*"))
     assert "recording: 100%" in err and "training: 100%" in err and "evaluate: 100%" in err
 

@@ -116,6 +116,10 @@ def test_no_verdict_where_the_rating_is_not_usable(write_folder):
     assert page.text.index("No verdict, because") < page.text.index("the seeds do not agree <b>at all</b>")
     assert "Look first at" not in page.text and "Look before you delete" not in page.text
     assert "--share" not in page.text and "--list keep.json" in page.text and "keep.json with all" not in page.text
+    assert (
+        not [a for a in page.all("tr") if a.get("class")]
+        and "The rating is not usable: the order may be chance" in page.text
+    )
 
 
 def test_names_from_files_stay_text(write_folder):

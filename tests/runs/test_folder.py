@@ -179,8 +179,12 @@ def test_ctrl_c_while_it_trains_leaves_nothing(file, tmp_path, monkeypatch, func
         return step(self, *args, **options)
 
     monkeypatch.setattr(GuardedStepper, "step", stopped)
-    with pytest.raises(KeyboardInterrupt):
-        function(file, tmp_path / "deep" / "run", **QUICK)
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # it is ignored where tests run in the background
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            function(file, tmp_path / "deep" / "run", **QUICK)
+    finally:
+        signal.signal(signal.SIGINT, before)
     assert list((tmp_path / "deep").iterdir()) == []
 
 

@@ -173,6 +173,8 @@ def load_policy(path: str | os.PathLike[str]) -> NumpyPolicy:
         with safe_open(file, "np") as handle:
             tensors = {name: handle.get_tensor(name) for name in handle.keys()}  # noqa: SIM118
             metadata = dict(handle.metadata() or {})
+        if lacking := sorted({str(value.dtype) for value in tensors.values() if value.dtype.kind not in "fiub"}):
+            raise TypeError(lacking[0])  # some packages add bfloat16 to NumPy, in three digits
     except SafetensorError as error:
         raise ValueError(f"{str(file)!r} is truncated or no safetensors file ({error}): copy it again") from error
     except TypeError as error:  # bfloat16 and float8, which NumPy lacks

@@ -18,6 +18,8 @@ import torch
 from tensordict import MemoryMappedTensor, TensorDict, TensorDictBase
 from torch import Tensor
 
+from torchrl_tsallis.jobs.files import disk_errors
+
 #: Bytes of a piece; what is computed of one takes a few times as much, far below 64 MiB.
 PIECE = 2 * 2**20
 _WRITING, _ROWS = ".writing", "rows"
@@ -68,13 +70,14 @@ def _on_disk(data: TensorDictBase) -> bool:
 
 def _allocate(row: TensorDictBase, size: int, folder: str | None) -> TensorDictBase:
     """An empty memory map ``[size]`` of rows like ``row`` ``[1]``; without a folder in shared memory."""
-    out = TensorDict(row.to_dict(), [1]).expand(size).memmap_like(prefix=folder)
-    if folder is not None and hasattr(os, "posix_fallocate"):
-        for file in Path(folder).rglob("*.memmap"):  # a full disk is an error now, and a killed process later
-            with file.open("r+b") as handle:
-                if length := os.fstat(handle.fileno()).st_size:
-                    os.posix_fallocate(handle.fileno(), 0, length)
-    return out
+    with disk_errors(folder or "shared memory"):
+        out = TensorDict(row.to_dict(), [1]).expand(size).memmap_like(prefix=folder)
+        if folder is not None and hasattr(os, "posix_fallocate"):
+            for file in Path(folder).rglob("*.memmap"):  # a full disk is an error now, and a killed process later
+                with file.open("r+b") as handle:
+                    if length := os.fstat(handle.fileno()).st_size:
+                        os.posix_fallocate(handle.fileno(), 0, length)
+        return out
 
 
 def _copy(source: TensorDictBase, target: TensorDictBase, start: int) -> None:

@@ -54,8 +54,8 @@ def panels(rated: RatingsFolder, calibration: Mapping[int, float]) -> dict[str, 
             Panel(
                 partial(figures.draw_strip, surprise=surprise, lengths=rated.lengths),
                 f"Strip of all {len(mean)} episodes: the stronger the colour, the greater the surprise of that part",
-                7.4,
-                1.9,
+                9.6,
+                2.2,
             )
         ],
         "agreement": [

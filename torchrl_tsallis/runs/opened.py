@@ -15,6 +15,7 @@ from torchrl.modules import IndependentNormal, ProbabilisticActor
 from torchrl_tsallis.data.robust_scaling import RobustScaling
 from torchrl_tsallis.modules.policy import make_policy
 from torchrl_tsallis.objectives.bc import TsallisBCLoss
+from torchrl_tsallis.objectives.cat import CATSoftUpdate
 from torchrl_tsallis.runs.folder import RUN, read_csv, read_json
 from torchrl_tsallis.runs.policies import ScaledMeanPolicy, ScaledNetwork
 from torchrl_tsallis.runs.saved import load_tensors, make_rating, read_scaling, read_settings
@@ -97,6 +98,7 @@ class Run:
             try:
                 loss.rating_module.load_state_dict(state)
                 if loss.needs_target:
+                    CATSoftUpdate(loss)  # TorchRL warns of a target network that no updater follows
                     file = self.folder / "target.safetensors"
                     target = TensorDict(load_tensors(file), []).unflatten_keys(".")
                     loss.target_actor_network_params.data.update_(target)

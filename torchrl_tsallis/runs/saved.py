@@ -122,7 +122,7 @@ def save_run(
     scaling: RobustScaling | None = None,
     target: Mapping[str, Tensor] | None = None,
 ) -> dict[str, Any]:
-    """Writes what :class:`~torchrl_tsallis.runs.Run` opens: policy, rating, scaling, and ``run.json`` last.
+    """Writes what :class:`~torchrl_tsallis.runs.Run` opens: rating, scaling, ``run.json``, and last the policy.
 
     Args:
         folder: of the run; other files in it stay.
@@ -145,7 +145,6 @@ def save_run(
     """
     place = Path(folder)
     method = describe_rating(rating)
-    save_tensors(place / "policy.safetensors", actor)
     save_tensors(place / "rating.safetensors", rating)
     if target is not None:
         save_tensors(place / "target.safetensors", target)
@@ -161,6 +160,7 @@ def save_run(
         "command": command,
     }
     write_json(place / RUN, settings)
+    save_tensors(place / "policy.safetensors", actor)  # last: recipes take it for the mark of a finished training
     return settings
 
 
