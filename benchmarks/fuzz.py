@@ -243,11 +243,8 @@ def fuzz_option(recipe: str, option: str, examples: int, loaded: Any = None) -> 
             if not fuzz_recipes.allowed(option, before, value):
                 faults.append(Fault(recipe, option, "accepted", shown(value), ""))
             return
-        kind = (
-            judged(error, (option, *option.split(".")[-1:], *option.split(".")[-1].removesuffix("_key").split()))
-            if isinstance(error, SystemExit)
-            else "raw"
-        )
+        leaf = option.split(".")[-1]
+        kind = judged(error, (option, leaf, leaf.removesuffix("_key"))) if isinstance(error, SystemExit) else "raw"
         if kind:
             faults.append(Fault(recipe, option, kind, shown(value), f"{type(error).__name__}: {error}"[:150]))
 

@@ -26,18 +26,8 @@ RECIPES: dict[str, tuple[str, ...]] = {
     "train_experts": ("train", "write_card"),
 }
 #: Options in which a value of another kind than the default's has a meaning.
-FREE = (
-    "hydra",
-    "methods",
-    "grids",
-    "ratings",
-    "_target_",
-    "_partial_",
-    "_convert_",
-    "process_group",
-    "card.history",
-    "ray",
-)
+FREE = ("hydra", "methods", "grids", "ratings", "ray", "card.history")
+FREE += ("_target_", "_partial_", "_convert_", "process_group")
 
 
 def _reach(*_: Any, **__: Any) -> Any:

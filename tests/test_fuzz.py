@@ -12,6 +12,7 @@ pytest.importorskip("hypothesis")
 sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
 
 import fuzz  # noqa: E402
+import fuzz_recipes  # noqa: E402
 import torch  # noqa: E402
 from fuzz_inputs import NETWORKS, consumers  # noqa: E402
 from fuzz_kinds import kind_of  # noqa: E402
@@ -35,6 +36,19 @@ def test_arguments_are_refused_by_name_or_accepted_rightly(subject):
 def test_spoilt_data_is_refused_by_name_or_taken(name):
     calls, faults = fuzz.fuzz_input(name, consumers()[name], EXAMPLES)
     assert calls and not faults, told(faults)
+
+
+@pytest.mark.parametrize("recipe", fuzz_recipes.RECIPES)
+def test_recipe_options_end_in_one_line_or_are_accepted_rightly(recipe):
+    for package in ("hydra", "pybullet", "gymnasium", "matplotlib", "tqdm"):
+        pytest.importorskip(package)
+    loaded = fuzz_recipes.load(fuzz.RECIPES, recipe)
+    places = list(fuzz_recipes.leaves(loaded[1]))
+    if recipe in ("ant_figure3", "ant_regimes"):  # they share the parts of ant_noise
+        places = [place for place in places if "." not in place]
+    for place in places:
+        calls, faults = fuzz.fuzz_option(recipe, place, 3, loaded)
+        assert not faults, told(faults)
 
 
 def test_nothing_of_the_table_is_missing():
