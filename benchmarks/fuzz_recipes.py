@@ -105,7 +105,9 @@ def allowed(option: str, before: Any, value: Any) -> bool:
         good = isinstance(value, Real) and not isinstance(value, bool) and value == value
         if isinstance(value, list):  # one or a list, for some
             return bool(value) and all(allowed(option, before, part) for part in value)
-        whole = not isinstance(before, Integral) or isinstance(value, Integral) or float(value).is_integer()
+        if not isinstance(value, Real):
+            return False
+        whole = not isinstance(before, Integral) or isinstance(value, Integral) or value % 1 == 0
         return good and whole and (abs(value) < math.inf or option.split(".")[-1] in INFINITE)
     if isinstance(before, str):
         return isinstance(value, str) or (isinstance(value, list) and all(isinstance(one, str) for one in value))
