@@ -24,6 +24,7 @@ from ant_units import Key
 from common import as_list
 from figure3_report import read_raw, report, save_raw
 from omegaconf import DictConfig
+from options import check_options, check_parts
 
 
 def wanted_of(cfg: DictConfig) -> list[Key]:
@@ -38,6 +39,8 @@ def wanted_of(cfg: DictConfig) -> list[Key]:
 def main(cfg: DictConfig) -> None:
     """Runs and shows, or only shows."""
     start = time.monotonic()
+    check_options(cfg)
+    check_parts(cfg)
     if cfg.mode == "run":
         save_raw(cfg.results, run(cfg, wanted_of(cfg)))
     elif cfg.mode != "report":

@@ -25,6 +25,7 @@ from ant_report import kinds_of, read_returns, report, save_returns
 from common import as_list, keep_method_settings, make_rating, make_trainer, save_as_run
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
+from options import check_options, check_parts
 from safetensors.torch import load_file, save_file
 from torchrl._utils import logger as torchrl_logger
 
@@ -120,6 +121,8 @@ def main(cfg: DictConfig) -> None:
     """Records, trains, evaluates and shows."""
     start = time.monotonic()
     torchrl_logger.setLevel("ERROR")
+    check_options(cfg)
+    check_parts(cfg)
     units = units_of(cfg)
     folders = {unit: folder_of(unit, cfg) for unit in units}
     if not cfg.resume:

@@ -24,6 +24,7 @@ from ant_units import Key
 from common import as_list
 from figure3_report import read_raw
 from omegaconf import DictConfig
+from options import check_grids, check_options, check_parts
 from regimes_report import report, save_raw
 
 
@@ -32,7 +33,7 @@ def wanted_of(cfg: DictConfig) -> list[Key]:
     names = list(cfg.grids) if cfg.part is None else as_list(cfg.part)
     unknown = [name for name in names if name not in cfg.grids]
     if unknown:
-        raise SystemExit(f"no grid {unknown[0]!r}: choose of {', '.join(cfg.grids)}")
+        raise SystemExit(f"part: no grid {unknown[0]!r}, choose of {', '.join(cfg.grids)}")
     seeds = list(range(cfg.seeds)) if isinstance(cfg.seeds, int) else as_list(cfg.seeds)
     keys = []
     for name in names:
@@ -48,6 +49,9 @@ def wanted_of(cfg: DictConfig) -> list[Key]:
 def main(cfg: DictConfig) -> None:
     """Runs and shows, or only shows."""
     start = time.monotonic()
+    check_options(cfg)
+    check_grids(cfg)
+    check_parts(cfg)
     if cfg.mode == "run":
         save_raw(cfg.results, run(cfg, wanted_of(cfg)))
     elif cfg.mode != "report":

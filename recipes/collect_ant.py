@@ -14,6 +14,7 @@ from pathlib import Path
 import hydra
 import torch
 from omegaconf import DictConfig
+from options import check_options, one_seed, size
 from tensordict import TensorDict
 
 from torchrl_tsallis.data import load_demonstrations, load_policy, record_trajectory, save_demonstrations
@@ -85,6 +86,7 @@ def collect_dataset(
 @hydra.main(version_base="1.3", config_path=".", config_name="collect_ant")
 def main(cfg: DictConfig) -> None:
     """Records and says what was recorded."""
+    check_options(cfg, {"std": size, "seed": one_seed})
     data = collect_dataset(
         cfg.output, std=cfg.std, seed=cfg.seed, clip=cfg.clip, workers=cfg.workers, progress=cfg.progress
     )

@@ -17,6 +17,7 @@ import hydra
 import numpy as np
 import torch
 from omegaconf import DictConfig
+from options import check_options, count, one_seed
 from tensordict import TensorDict
 
 from torchrl_tsallis.data import flip_demonstrations, load_demonstrations, save_demonstrations, teleoperation
@@ -134,6 +135,7 @@ def show(data: TensorDict, seed: int, folder: Path) -> None:
 @hydra.main(version_base="1.3", config_path=".", config_name="collect_flip")
 def main(cfg: DictConfig) -> None:
     """Records, and says what was recorded."""
+    check_options(cfg, {"seed": one_seed, "steps": count})
     keys = ("trajectories", "seed", "steps", "workers", "replay", "progress")
     data, metadata = collect_flips(cfg.output, **{key: cfg[key] for key in keys})
     summary = summarise(data, metadata["trajectories"])

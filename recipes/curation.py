@@ -29,6 +29,7 @@ from collect_flip import collect_flips
 from curation_report import COLUMNS, read_rows, report, write_rows
 from curation_scores import of_human, of_labels, rated
 from omegaconf import DictConfig
+from options import check_options, check_parts, check_text, listed, one_seed, share, size
 from regimes_report import save_raw
 from torchrl import torchrl_logger
 
@@ -36,6 +37,15 @@ from torchrl_tsallis.jobs import atomic_path, run_jobs, tick
 
 Cell = tuple[str, float, int]  # task, std, seed
 FLIPS = "page_flip"
+#: Options of the policies without some episodes, and those of another kind than elsewhere.
+CURATED = {
+    "curated.tasks": listed(check_text),
+    "curated.stds": listed(size),
+    "curated.seeds": listed(one_seed),
+    "curated.rules": listed(check_text),
+    "curated.share": share,
+    "curated.methods": listed(check_text),
+}
 
 
 def rate_cell(cell: Cell, cfg: DictConfig) -> None:
@@ -118,6 +128,8 @@ def wanted_of(cfg: DictConfig) -> list[Key]:
 @hydra.main(version_base="1.3", config_path=".", config_name="curation")
 def main(cfg: DictConfig) -> None:
     """Runs and shows, or only shows."""
+    check_options(cfg, CURATED if cfg.curated is not None else {})
+    check_parts(cfg)
     results = Path(cfg.results)
     if cfg.mode == "run":
         write_rows(results / "curation.csv", detect(cfg))

@@ -26,6 +26,7 @@ from common import as_list, keep_method_settings, make_rating, make_trainer
 from flip_report import faults_of, read_rows, report, save_rows
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
+from options import check_options, check_parts
 from safetensors.torch import load_file, save_file
 from torchrl._utils import logger as torchrl_logger
 from torchrl.modules import set_recurrent_mode
@@ -153,6 +154,8 @@ def main(cfg: DictConfig) -> None:
     """Records, trains, flips and shows."""
     start = time.monotonic()
     torchrl_logger.setLevel("ERROR")
+    check_options(cfg)
+    check_parts(cfg)
     units = units_of(cfg)
     folders = {unit: folder_of(unit, cfg) for unit in units}
     if not cfg.resume:

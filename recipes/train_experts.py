@@ -22,6 +22,22 @@ import hydra
 import numpy as np
 import torch
 from omegaconf import DictConfig
+from options import (
+    by_name,
+    check_flag,
+    check_number,
+    check_options,
+    check_path,
+    check_text,
+    choice,
+    count,
+    listed,
+    one_seed,
+    positive,
+    share,
+    size,
+    whole,
+)
 from sac import export_policy, make_loss, numpy_policy, written_out
 from safetensors import safe_open
 from safetensors.torch import save_file
@@ -34,6 +50,18 @@ from torchrl_tsallis.envs import register_ant
 from torchrl_tsallis.jobs import atomic_path, run_jobs, tick
 
 KEYS = ["observation", "action", ("next", "observation"), ("next", "reward"), ("next", "terminated")]
+
+
+#: What the options may be that other recipes do not have, or have of another kind.
+OWN = {
+    "mode": choice("train", "card"), "env_id": check_text, "seed": one_seed, "steps": count, "out": check_path,
+    "save_buffer": check_flag, "actor_cells": listed(count), "critic_cells": listed(count),
+    "env_steps_per_update": count, "frames_per_batch": count, "gamma": share, "tau": share, "lr": positive,
+    "lr_final": size, "target_entropy": partial(check_number, low=-1e9, high=1e9), "buffer_size": count,
+    "random_steps": whole, "eval_every": count, "eval_episodes": count, "card.episodes": count,
+    "card.path": check_path, "card.policies_dir": check_path, "card.history": check_text,
+    "card.policies": by_name(check_path),
+}  # fmt: skip
 
 
 def evaluate(env: gym.Env, policy: Callable, episodes: int, rng: np.random.Generator | None = None) -> np.ndarray:
@@ -181,6 +209,7 @@ demonstrations in simulation and comparing imitation learners; they are not fit 
 @hydra.main(version_base="1.3", config_path=".", config_name="train_experts")
 def main(cfg: DictConfig) -> None:
     """Run the configured mode."""
+    check_options(cfg, OWN)
     {"train": train, "card": write_card}[cfg.mode](cfg)
 
 

@@ -8,7 +8,14 @@ from __future__ import annotations
 
 import torch
 from tensordict import TensorDict, TensorDictBase
+from tensordict.utils import NestedKey
+from torch import Tensor
 
+from torchrl_tsallis._checks import check_number, check_seed, shown
+from torchrl_tsallis.data.schema import check_rows, leaves
+
+#: The most that a float32 action may be moved by.
+LARGEST = 1e30
 #: Task -> (artificial noise, amateur), section V-A.
 TASKS = {
     "clean": (False, False),
@@ -16,6 +23,31 @@ TASKS = {
     "amateur": (False, True),
     "both": (True, True),
 }
+
+
+def _rows_with(data: TensorDictBase, name: str, key: NestedKey) -> Tensor:
+    """An entry of flat demonstrations that have rows; the message of what is missing names argument and key."""
+    if not isinstance(data, TensorDictBase) or data.ndim != 1 or not len(data):
+        got = f"the batch size {list(data.shape)}" if isinstance(data, TensorDictBase) else f"a {type(data).__name__}"
+        raise TypeError(f"{name} must be demonstrations, a TensorDict of N rows, got {got}")
+    return leaves(data, [key])[key]
+
+
+def _layout(data: TensorDictBase, dtypes: bool) -> dict[NestedKey, str]:
+    """Shape, and perhaps dtype, of each entry's rows."""
+    found = {key: value for key, value in data.items(True, True) if isinstance(value, Tensor)}
+    return {key: f"{list(x.shape[1:])}{f' of {x.dtype}' * dtypes}" for key, x in found.items()}
+
+
+def _check_alike(experts: TensorDictBase, others: TensorDictBase, name: str, *, dtypes: bool = False) -> None:
+    """Raises for rows of another layout, which cannot stand in the experts' place."""
+    own, other = _layout(experts, dtypes), _layout(others, dtypes)
+    for key in own.keys() | other.keys():
+        if own.get(key) != other.get(key):
+            raise ValueError(
+                f"{key!r} of the demonstrations is {own.get(key, 'missing')} in experts and "
+                f"{other.get(key, 'missing')} in {name}: both need the same entries"
+            )
 
 
 def add_action_noise(
@@ -42,10 +74,15 @@ def add_action_noise(
         >>> torch.equal(noisy["action"][:, 0], 5.0 * noisy["info", "is_noise"])
         True
     """
-    if not 0 <= probability <= 1 or scale < 0:
-        raise ValueError(f"probability must be in [0, 1] and scale not negative, got {probability=} and {scale=}")
-    generator = torch.Generator().manual_seed(seed)
-    action = demonstrations["action"]
+    probability = check_number("probability", probability, low=0, high=1)
+    mean = float(check_number("mean", mean, low=-LARGEST, high=LARGEST))
+    scale = float(check_number("scale", scale, low=0, high=LARGEST))
+    generator = torch.Generator().manual_seed(check_seed("seed", seed))
+    action = _rows_with(demonstrations, "demonstrations", "action")
+    if not action.is_floating_point() or action.ndim != 2:
+        raise TypeError(
+            f"'action' is {action.dtype} of shape {list(action.shape)}: noise needs vectors of real numbers"
+        )
     hit = torch.rand(action.shape[:1], generator=generator) < probability
     noise = mean + scale * torch.randn(action.shape, generator=generator, dtype=action.dtype)
     out = demonstrations.clone()
@@ -80,15 +117,20 @@ def replace_with_amateur(
         >>> replace_with_amateur(rows(4), rows(1))["info", "is_amateur"].sum()
         tensor(1)
     """
+    per_expert = int(check_number("per_expert", per_expert, low=0, integer=True))
+    _rows_with(experts, "experts", ("info", "expert"))
     for name, side in (("experts", experts), ("amateur", amateur)):
-        runs = side["info", "episode"].unique_consecutive()
+        runs = _rows_with(side, name, ("info", "episode")).unique_consecutive()
         numbers, counts = runs.unique(return_counts=True)
         if (counts > 1).any():
             raise ValueError(
                 f"trajectory {numbers[counts > 1][0].item()} of the {name} stands in two runs of rows, and its rows "
                 "would be taken twice: give each trajectory a number of its own under ('info', 'episode')"
             )
-    generator = torch.Generator().manual_seed(seed)
+        check_rows(side, [("info", "episode")])
+    check_rows(experts, [("info", "expert")])
+    _check_alike(experts, amateur, "amateur")
+    generator = torch.Generator().manual_seed(check_seed("seed", seed))
     spare = amateur["info", "episode"].unique().tolist()
     replaced: dict[int, int] = {}
     for expert in experts["info", "expert"].unique().tolist():
@@ -146,8 +188,11 @@ def make_task(
         ...
         ValueError: no task 'noisy': choose one of clean, artificial, amateur, both
     """
-    if task not in TASKS:
-        raise ValueError(f"no task {task!r}: choose one of {', '.join(TASKS)}")
+    if not isinstance(task, str) or task not in TASKS:
+        raise ValueError(f"no task {shown(task)}: choose one of {', '.join(TASKS)}")
+    probability = check_number("probability", probability, low=0, high=1)
+    mean = float(check_number("mean", mean, low=-LARGEST, high=LARGEST))
+    scale, seed = float(check_number("scale", scale, low=0, high=LARGEST)), check_seed("seed", seed)
     artificial, with_amateur = TASKS[task]
     out = replace_with_amateur(experts, amateur, seed=seed) if with_amateur else experts.clone()
     if artificial:
@@ -179,9 +224,12 @@ def replace_pairs(experts: TensorDictBase, others: TensorDictBase, *, share: flo
         >>> torch.equal(mixed["action"][:, 0].bool(), mixed["info", "is_amateur"])
         True
     """
-    if not 0 <= share <= 1:
-        raise ValueError(f"share must be in [0, 1], got {share}")
-    generator = torch.Generator().manual_seed(seed)
+    share = check_number("share", share, low=0, high=1)
+    generator = torch.Generator().manual_seed(check_seed("seed", seed))
+    _rows_with(experts, "experts", ("info", "is_amateur"))
+    check_rows(others, ["action"])
+    pairs = experts.exclude("info")
+    _check_alike(pairs, others.select(*pairs.keys(), strict=False), "others", dtypes=True)
     hit = torch.rand(experts.shape, generator=generator) < share
     drawn = torch.randint(len(others), (int(hit.sum()),), generator=generator)
     out = experts.clone()

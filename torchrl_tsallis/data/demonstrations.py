@@ -13,6 +13,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from tensordict import TensorDict, TensorDictBase
 
+from torchrl_tsallis._checks import check_callable, check_flag, check_number, check_path, check_seed, shown
 from torchrl_tsallis.data.episodes import find_episodes, has_episodes
 from torchrl_tsallis.data.policy import NumpyPolicy
 from torchrl_tsallis.data.schema import check_layout, check_pairs
@@ -52,7 +53,15 @@ def record_trajectory(
     Raises:
         RuntimeError: if every episode ended early.
     """
+    check_callable("make_env", make_env, "makes the environment")
+    if not callable(getattr(policy, "act", None)):
+        raise TypeError(f"policy must be a NumpyPolicy, such as load_policy('expert_0'), got {shown(policy)}")
+    std, seed, clip = check_number("std", std, low=0), check_seed("seed", seed, low=0), check_flag("clip", clip)
+    length = int(check_number("length", length, low=1, integer=True))
+    tries = int(check_number("tries", tries, low=1, integer=True))
     env = make_env()
+    if not hasattr(env, "reset"):
+        raise TypeError(f"make_env must make an environment of gymnasium, it made {shown(env)}")
     env.reset(seed=seed)  # the first episode of a fresh PyBullet environment starts unlike all later ones
     for attempt in range(tries):
         rng = np.random.default_rng([seed, attempt])
@@ -94,6 +103,7 @@ def save_demonstrations(path: str | os.PathLike[str], demonstrations: TensorDict
         TypeError: if the metadata is nothing that JSON can hold.
         ValueError: if the demonstrations are not ``[N]``, or a key has a dot, by which the file would nest it.
     """
+    path = check_path("path", path)
     check_layout(demonstrations)
     try:
         recording = json.dumps(metadata)
@@ -101,7 +111,13 @@ def save_demonstrations(path: str | os.PathLike[str], demonstrations: TensorDict
         raise TypeError(
             f"the metadata of {str(path)!r} is not JSON-able ({error}): convert it to plain numbers"
         ) from error
-    flat = {key: value.contiguous() for key, value in demonstrations.flatten_keys(".").items()}
+    found = dict(demonstrations.flatten_keys(".").items())
+    for key, value in found.items():
+        if not isinstance(value, torch.Tensor):
+            raise TypeError(
+                f"{key!r} of the demonstrations is {shown(value)}, needed are tensors: put it in the metadata"
+            )
+    flat = {key: value.contiguous() for key, value in found.items()}
     with atomic_path(path) as temporary:
         save_file(flat, temporary, {"recording": recording})
 
@@ -128,7 +144,8 @@ def load_demonstrations(path: str | os.PathLike[str]) -> tuple[TensorDict, dict[
         >>> data.shape, metadata
         (torch.Size([4]), {'std': 0.2})
     """
-    name = repr(str(path))
+    path = check_path("path", path)
+    name = repr(path)
     try:
         with safe_open(path, "pt") as handle:
             flat = {key: handle.get_tensor(key) for key in handle.keys()}  # noqa: SIM118
@@ -180,6 +197,8 @@ def validate_demonstrations(demonstrations: TensorDictBase, *, action_limit: flo
     Examples:
         >>> validate_demonstrations(TensorDict({"observation": torch.rand(3, 2), "action": torch.rand(3, 1)}, [3]))
     """
+    if action_limit is not None:
+        action_limit = float(check_number("action_limit", action_limit, above=0))
     check_pairs(demonstrations, action_limit=action_limit)
     if has_episodes(demonstrations):
         find_episodes(demonstrations, open_end=True)

@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from tensordict import TensorDict
 
+from torchrl_tsallis._checks import check_callable, check_number, check_seed, shown
 from torchrl_tsallis.data.teleoperation import FlipOperator, Stroke, Style
 from torchrl_tsallis.envs.flips import FlipCount, count_flips
 
@@ -63,7 +64,11 @@ def record_flips(
         the contact force ``[3]`` in N; and the facts: ``seed``, ``flips``, ``sizes`` of the events, ``strokes``, and
         the numbers of strokes that are ``missed`` and ``multiple``.
     """
+    check_callable("make_env", make_env, "makes the environment")
+    seed, steps = check_seed("seed", seed, low=0), int(check_number("steps", steps, low=1, integer=True))
     env = make_env()
+    if not hasattr(env, "reset"):
+        raise TypeError(f"make_env must make an environment of gymnasium, it made {shown(env)}")
     observation, info = env.reset(seed=seed)
     operator = FlipOperator(seed, style)
     rows: list[tuple[np.ndarray, ...]] = []
@@ -108,8 +113,13 @@ def replay_forces(make_env: Callable[[], Any], forces: torch.Tensor, *, seed: in
     Returns:
         The observations after each force, ``[T, 12]``, and what was flipped.
     """
+    check_callable("make_env", make_env, "makes the environment")
+    if not isinstance(forces, torch.Tensor) or forces.ndim != 2:
+        raise TypeError(f"forces must be a tensor [T, 3], got {shown(forces)}")
     env = make_env()
-    _, info = env.reset(seed=seed)
+    if not hasattr(env, "reset"):
+        raise TypeError(f"make_env must make an environment of gymnasium, it made {shown(env)}")
+    _, info = env.reset(seed=check_seed("seed", seed, low=0))
     angles, observations = [info["edge_angles"]], []
     for force in forces.numpy():
         observation, _, _, _, info = env.step(force)

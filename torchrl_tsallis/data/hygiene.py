@@ -7,12 +7,15 @@ whether a demonstration is good.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from numbers import Real
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor
 
+from torchrl_tsallis._checks import check_number, shown
 from torchrl_tsallis.data.episodes import find_episodes, has_episodes
 from torchrl_tsallis.data.findings import Finding, named, text, vectors
 from torchrl_tsallis.data.hygiene_steps import find_boundaries, find_copies, find_lengths, find_still, find_time_jumps
@@ -127,6 +130,21 @@ def find_outside(demonstrations: TensorDictBase, *, low: float | Tensor, high: f
     return out
 
 
+def _check_tensor(name: str, value: Any, size: int | None) -> None:
+    """Raises for what are no real numbers without NaN; of ``size`` rows each has to have one."""
+    number = isinstance(value, Real) and not isinstance(value, bool) and size is None
+    tensor = isinstance(value, Tensor) and not value.is_complex() and value.dtype != torch.bool and value.numel() > 0
+    if not number and not tensor:
+        wanted = "a number or a tensor [A]" if size is None else "a tensor [N]"
+        raise TypeError(f"{name} must be {wanted}, got {shown(value)}")
+    if number:
+        check_number(name, value)
+    elif bool(value.isnan().any()):
+        raise ValueError(f"{name} must have no NaN, got {shown(value)}")
+    elif size is not None and value.numel() != size:
+        raise ValueError(f"{value.numel()} {name} for {size} rows: give one a row")
+
+
 def inspect_demonstrations(
     demonstrations: TensorDictBase,
     *,
@@ -156,8 +174,12 @@ def inspect_demonstrations(
         >>> [finding.kind for finding in inspect_demonstrations(TensorDict(rows, [4]))]
         ['constant', 'length_one']
     """
-    if not check_layout(demonstrations):
+    size = check_layout(demonstrations)
+    if not size:
         raise ValueError("the demonstrations are empty: there is no row")
+    for name, value in (("low", low), ("high", high), ("timestamps", timestamps)):
+        if value is not None:
+            _check_tensor(name, value, size if name == "timestamps" else None)
     out = find_non_finite(demonstrations)
     broken = {finding.key for finding in out}
     finite = [key for key in leaves(demonstrations, _KEYS) if text(key) not in broken]

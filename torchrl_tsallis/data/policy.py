@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping
 from pathlib import Path
+from types import NoneType
 from typing import Any
 
 import numpy as np
 from safetensors import SafetensorError, safe_open
+
+from torchrl_tsallis._checks import check_path, shown
 
 #: Folder of the shipped policies.
 POLICIES = Path(__file__).parent / "policies"
@@ -69,7 +73,7 @@ def as_weights(name: str, value: Any) -> np.ndarray:
     value = value.detach().cpu().float().numpy() if hasattr(value, "detach") else value
     try:
         array = np.array(value, dtype=np.float32)
-    except (TypeError, ValueError) as error:
+    except Exception as error:  # whatever an object that is no array raises
         raise ValueError(f"{name} must be an array of numbers, got a {type(value).__name__}") from error
     if not np.isfinite(array).all():
         raise ValueError(f"{name} is not finite: the training has diverged, or the file is damaged")
@@ -95,6 +99,10 @@ class NumpyPolicy:
     """
 
     def __init__(self, tensors: dict[str, np.ndarray], metadata: dict[str, str] | None = None) -> None:
+        if not isinstance(tensors, Mapping):
+            raise TypeError(f"tensors must be a mapping, name -> array, of {', '.join(_NAMES)}; got {shown(tensors)}")
+        if not isinstance(metadata, (Mapping, NoneType)):
+            raise TypeError(f"metadata must be a mapping, or None, got {shown(metadata)}")
         missing = [name for name in _NAMES if name not in tensors]
         if missing:
             raise ValueError(
@@ -107,7 +115,7 @@ class NumpyPolicy:
                 "of another network"
             )
         self.tensors = {name: as_weights(name, tensors[name]) for name in _NAMES}
-        self.metadata = metadata or {}
+        self.metadata = {} if metadata is None else dict(metadata)
         if self.tensors["w1"].ndim != 2:
             raise ValueError(f"w1 of shape {list(self.tensors['w1'].shape)} must be a matrix [obs_dim, H]")
         width = self.tensors["w1"].shape[0]
@@ -155,11 +163,12 @@ def load_policy(path: str | os.PathLike[str]) -> NumpyPolicy:
         ...
         FileNotFoundError: no policy 'expert_9': give a safetensors file or the name of a shipped policy
     """
+    path = check_path("path", path)
     file = Path(path)
-    if not file.exists():
+    if not os.path.isfile(file):  # Path.exists() raises for a name that is too long
         file = POLICIES / f"{path}.safetensors"
-    if not file.exists():
-        raise FileNotFoundError(f"no policy {str(path)!r}: give a safetensors file or the name of a shipped policy")
+    if not os.path.isfile(file):
+        raise FileNotFoundError(f"no policy {shown(path)}: give a safetensors file or the name of a shipped policy")
     try:
         with safe_open(file, "np") as handle:
             tensors = {name: handle.get_tensor(name) for name in handle.keys()}  # noqa: SIM118

@@ -10,6 +10,7 @@ from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torchrl.data import SamplerWithoutReplacement, TensorDictReplayBuffer
 
+from torchrl_tsallis._checks import check_keys, check_seed
 from torchrl_tsallis.data.schema import check_rows
 from torchrl_tsallis.data.storage import check_batch_size, make_buffer, make_storage
 
@@ -54,6 +55,7 @@ def make_replay_buffer(
         torch.Size([4, 2])
     """
     check_batch_size(batch_size=batch_size)
+    seed, keys = check_seed("seed", seed), check_keys("keys", keys)
     check_rows(demonstrations, keys, least=batch_size)
     storage = make_storage([demonstrations.select(*keys)], scratch_dir, dtype=dtype)
     buffer = make_buffer(storage, SamplerWithoutReplacement(drop_last=True), batch_size)

@@ -10,6 +10,7 @@ from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor
 
+from torchrl_tsallis._checks import check_keys, shown
 from torchrl_tsallis.data.rows import map_rows, pieces, row_bytes
 from torchrl_tsallis.data.scaling import ROUNDINGS
 from torchrl_tsallis.data.schema import check_rows
@@ -152,6 +153,12 @@ class RobustScaling:
     """
 
     def __init__(self, centres: Mapping[NestedKey, Tensor], scales: Mapping[NestedKey, Tensor]) -> None:
+        for what, given in (("centres", centres), ("scales", scales)):
+            if not isinstance(given, Mapping) or not all(
+                isinstance(value, Tensor) and value.is_floating_point() for value in dict(given.items()).values()
+            ):
+                raise TypeError(f"{what} must be a mapping, key -> tensor [D] of real numbers, got {shown(given)}")
+        centres, scales = dict(centres.items()), dict(scales.items())
         if centres.keys() != scales.keys():
             raise ValueError(f"centres of {list(centres)} and scales of {list(scales)}: give both for each key")
         for key, scale in scales.items():
@@ -179,7 +186,7 @@ class RobustScaling:
             TypeError: if what is under it is no tensor of real numbers.
             ValueError: if there is no row, or one is NaN or infinite.
         """
-        found = check_rows(demonstrations, keys)
+        found = check_rows(demonstrations, check_keys("keys", keys))
         vectors = {key: value for key, value in found.items() if value.ndim == 2 and value.is_floating_point()}
         statistics = {key: robust_statistics(value) for key, value in vectors.items()}
         return cls(*({key: pair[k] for key, pair in statistics.items()} for k in (0, 1)))

@@ -10,8 +10,9 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
+from torchrl_tsallis._checks import check_number, shown
 from torchrl_tsallis.data.rows import PIECE, map_rows, pieces, row_bytes
-from torchrl_tsallis.data.schema import leaves
+from torchrl_tsallis.data.schema import bad_rows, leaves
 
 #: A spread below so many float32 roundings of the values themselves is no signal.
 ROUNDINGS = 64 * torch.finfo(torch.float32).eps
@@ -30,6 +31,10 @@ class Scaling:
         std: of the observation, ``[O]``, positive.
         action_unit: the action's unit, e.g. in N.
 
+    Raises:
+        TypeError: for a mean or deviation that is no vector.
+        ValueError: if one is not finite, or a deviation or the unit not positive.
+
     Examples:
         >>> from tensordict import TensorDict
         >>> data = TensorDict({"observation": torch.tensor([[1.0], [3.0]]), "action": torch.ones(2, 1)}, [2])
@@ -40,6 +45,18 @@ class Scaling:
     mean: Tensor
     std: Tensor
     action_unit: float
+
+    def __post_init__(self) -> None:
+        """Raises for what no data can be divided by."""
+        for name in ("mean", "std"):
+            value = getattr(self, name)
+            if not isinstance(value, Tensor) or not value.is_floating_point() or value.ndim != 1:
+                raise TypeError(f"{name} must be a tensor [O] of real numbers, got {shown(value)}")
+            if not value.isfinite().all() or value.shape != self.mean.shape:
+                raise ValueError(f"{name} must be finite, and std of the shape of mean, got {shown(value)}")
+        if not (self.std > 0).all():
+            raise ValueError(f"std must be positive, got {shown(self.std)}")
+        check_number("action_unit", self.action_unit, above=0)
 
     @classmethod
     def fit(cls, demonstrations: TensorDictBase, *, action_unit: float) -> Scaling:
@@ -52,14 +69,17 @@ class Scaling:
             TypeError: if the observation is a nested tensordict.
             ValueError: if the unit is not positive and finite, or the observation is no vector.
         """
-        if not 0 < action_unit < float("inf"):
-            raise ValueError(f"action_unit must be positive, got {action_unit}")
+        action_unit = check_number("action_unit", action_unit, above=0)
+        if not isinstance(demonstrations, TensorDictBase) or not demonstrations.ndim or 0 in demonstrations.shape:
+            raise ValueError(f"demonstrations must be a TensorDict of at least one row, got {shown(demonstrations)}")
         found = leaves(demonstrations, ["observation"])
         if list(found) != ["observation"]:
             raise TypeError(f"'observation' is nested, {list(found)}: use RobustScaling, or concatenate the vectors")
         observation = found["observation"]
         if observation.ndim <= demonstrations.ndim:
             raise ValueError(f"'observation' has shape {list(observation.shape)}, needed is a vector a row: [N, O]")
+        if bad_rows(observation.flatten(0, -2))[0]:
+            raise ValueError("'observation' is NaN or infinite in some rows: validate_demonstrations names them")
         mean, std = _moments(observation.flatten(0, -2))
         floor = torch.maximum(1e-9 * (1 + mean.abs()), ROUNDINGS * mean.abs())
         return cls(mean.float(), std.where(std > floor, 1.0).float(), float(action_unit))

@@ -224,5 +224,5 @@ def _check_limit(found: dict[NestedKey, Tensor], size: int, limit: float) -> Non
         if count:
             raise ValueError(
                 f"{key!r} is outside of [-{limit}, {limit}] in {count} of {size} rows, first {first}: clip the "
-                "executed action, or record it in the space's units"
+                "executed action, record it in the space's units, or raise action_limit"
             )

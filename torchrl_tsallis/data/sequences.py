@@ -12,6 +12,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.data import ImmutableDatasetWriter, SliceSamplerWithoutReplacement, TensorDictReplayBuffer
 
+from torchrl_tsallis._checks import check_keys, check_seed
 from torchrl_tsallis.data.episodes import ENDS, IS_INIT, Episodes, find_episodes, read_flag
 from torchrl_tsallis.data.schema import check_layout, check_rows
 from torchrl_tsallis.data.storage import check_batch_size, make_storage
@@ -90,6 +91,7 @@ def make_sequence_buffer(
         torch.Size([2, 4, 2])
     """
     check_batch_size(slice_len=slice_len, num_slices=num_slices)
+    seed, keys = check_seed("seed", seed), check_keys("keys", keys)
     check_layout(demonstrations)
     stored = [*keys, *(key for key in ENDS if key in demonstrations.keys(True) and key not in keys)]
     check_rows(demonstrations, stored, whole_episodes=True)

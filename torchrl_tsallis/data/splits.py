@@ -8,6 +8,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
+from torchrl_tsallis._checks import check_number, check_seed, shown
 from torchrl_tsallis.data.episodes import find_episodes
 from torchrl_tsallis.data.rows import take_rows
 
@@ -33,6 +34,7 @@ def split_episodes(demonstrations: TensorDictBase, share: float, *, seed: int = 
         >>> sorted(len(part) for part in split_episodes(data, 0.5))
         [2, 2]
     """
+    share, seed = check_number("share", share), check_seed("seed", seed)
     episodes = find_episodes(demonstrations, purpose="a split by trajectories")
     count = len(episodes.starts)
     held_out = max(1, round(share * count)) if 0 < share < 1 else count
@@ -67,10 +69,13 @@ def fold_episodes(demonstrations: TensorDictBase, folds: int, *, seed: int = 0) 
         >>> torch.stack(fold_episodes(data, 3)).sum(0)
         tensor([1, 1, 1, 1])
     """
+    seed = check_seed("seed", seed)
     episodes = find_episodes(demonstrations, purpose="a split into folds")
     count = len(episodes.starts)
     if isinstance(folds, bool) or not isinstance(folds, int) or not 2 <= folds <= count:
-        raise ValueError(f"{folds} folds of {count} episodes: give a whole number from 2 to the number of episodes")
+        raise ValueError(
+            f"{shown(folds)} folds of {count} episodes: give a whole number from 2 to the number of episodes"
+        )
     order = torch.randperm(count, generator=torch.Generator().manual_seed(seed))
     fold = torch.empty(count, dtype=torch.int64)
     fold[order] = torch.arange(count) % folds

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.utils import NestedKey
@@ -14,8 +15,24 @@ from torchrl.data import TensorDictReplayBuffer
 from torchrl.data.replay_buffers.samplers import Sampler
 from torchrl.data.replay_buffers.storages import Storage
 
+from torchrl_tsallis._checks import check_keys, check_seed, shown
 from torchrl_tsallis.data.schema import check_layout, check_rows
 from torchrl_tsallis.data.storage import check_batch_size, make_buffer, make_storage
+
+
+def check_seeds(seeds: Any) -> list[int]:
+    """Raises for what is no sequence of seeds, one a member; returns them as a list.
+
+    Examples:
+        >>> check_seeds([0, 1.5])
+        Traceback (most recent call last):
+        ...
+        TypeError: seeds[1] must be an integer, got 1.5
+    """
+    listed = seeds.tolist() if isinstance(seeds, (torch.Tensor, np.ndarray)) else seeds
+    if isinstance(listed, (str, bytes)) or not isinstance(listed, Sequence):
+        raise TypeError(f"seeds must be a sequence of integers, one a member, got {shown(seeds)}")
+    return [check_seed(f"seeds[{i}]", seed) for i, seed in enumerate(listed)]
 
 
 class MemberSampler(Sampler):
@@ -39,6 +56,9 @@ class MemberSampler(Sampler):
     """
 
     def __init__(self, seeds: Sequence[int], rows: Sequence[range]) -> None:
+        seeds = check_seeds(seeds)
+        if isinstance(rows, str) or not isinstance(rows, Sequence) or not all(isinstance(r, range) for r in rows):
+            raise TypeError(f"rows must be a sequence of ranges, one a member, got {shown(rows)}")
         if len(seeds) != len(rows) or not rows:
             raise ValueError(f"{len(seeds)} seeds and {len(rows)} ranges of rows were given: give one of each a member")
         self.rows = list(rows)
@@ -144,7 +164,14 @@ def make_stacked_replay_buffer(
         >>> make_stacked_replay_buffer(data, seeds=[0, 1, 2], batch_size=4).sample()["action"].shape
         torch.Size([3, 4, 2])
     """
+    seeds, keys = check_seeds(seeds), check_keys("keys", keys)
     shared = isinstance(demonstrations, TensorDictBase)
+    if not shared and (not isinstance(demonstrations, (list, tuple)) or len(demonstrations) != len(seeds)):
+        given = f"{len(demonstrations)} of them" if isinstance(demonstrations, (list, tuple)) else shown(demonstrations)
+        raise TypeError(
+            f"demonstrations must be a TensorDict for all members, or a list of {len(seeds)}, as many as seeds, got "
+            f"{given}"
+        )
     members: list[TensorDictBase] = [demonstrations] * len(seeds) if shared else list(demonstrations)
     unique = {id(member): member for member in members}
     check_batch_size(batch_size=batch_size)

@@ -15,6 +15,7 @@ from torch import Tensor
 from torchrl.data import ImmutableDatasetWriter, TensorDictReplayBuffer, TensorStorage
 from torchrl.data.replay_buffers.samplers import Sampler
 
+from torchrl_tsallis._checks import check_path, shown
 from torchrl_tsallis.data.rows import is_memory_mapped, store_rows
 
 _log = logging.getLogger(__name__)
@@ -74,7 +75,7 @@ def check_batch_size(**sizes: Any) -> None:
     """Raises for a size that is no positive whole number; the message names it."""
     for name, value in sizes.items():
         if isinstance(value, bool) or not isinstance(value, int) or value < 1:
-            raise ValueError(f"{name}={value!r} must be a positive whole number")
+            raise ValueError(f"{name}={shown(value)} must be a positive whole number")
 
 
 def make_storage(
@@ -94,7 +95,9 @@ def make_storage(
         ValueError: if the parts' entries differ in key, shape or dtype, or ``dtype`` is no floating-point one.
     """
     if dtype is not None and not (isinstance(dtype, torch.dtype) and dtype.is_floating_point):
-        raise ValueError(f"dtype={dtype!r} must be a floating-point dtype such as torch.float32")
+        raise ValueError(f"dtype={shown(dtype)} must be a floating-point dtype such as torch.float32")
+    if scratch_dir is not None:
+        scratch_dir = check_path("scratch_dir", scratch_dir)
     layouts = [{key: (tuple(x.shape[1:]), x.dtype) for key, x in part.items(True, True)} for part in parts]
     for layout in layouts[1:]:
         for key in layout.keys() | layouts[0].keys():

@@ -12,6 +12,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from torchrl_tsallis._checks import check_seed
+
 STIFFNESS, DAMPING = 120.0, 1.0  # N/m and N s/m, of the coupling
 RATE = 50  # Hz
 FORCE_LIMIT = 3.3  # N
@@ -169,7 +171,7 @@ class FlipOperator:
     """
 
     def __init__(self, seed: int, style: Style | None = None) -> None:
-        self._rng = np.random.default_rng([seed, 0xF11B])
+        self._rng = np.random.default_rng([check_seed("seed", seed, low=0), 0xF11B])
         self.style = style if style is not None else draw_style(self._rng)
         self.strokes: list[Stroke] = []
         self.begins: list[int] = []

@@ -7,6 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from torchrl_tsallis._checks import check_number, shown
+
 TURNED = math.radians(135.0)  # rad, of the free edge about the ring
 STAY = 0.5  # s, for which a page must stay turned
 WINDOW = 0.6  # s, pages that turn over this close together are one event
@@ -73,13 +75,19 @@ def count_flips(
         >>> flips.total, flips.singles, flips.multiples, flips.pages.tolist()
         (3, 1, 1, [2, 1, 0])
     """
+    dt, turned = check_number("dt", dt, above=0), check_number("turned", turned)
+    stay, window = check_number("stay", stay, low=0), check_number("window", window, low=0)
+    try:
+        history = np.asarray(angles, dtype=np.float64)
+    except Exception as error:  # whatever an object that is no array raises
+        raise TypeError(f"angles must be a history [T, pages] of numbers, got {shown(angles)}") from error
+    if history.ndim != 2 or not np.isfinite(history).all():
+        raise ValueError(f"angles must be a finite history [T, pages] in rad, not {list(history.shape)}")
     angles = np.asarray(angles)
-    if angles.ndim != 2 or not np.isfinite(angles).all():
-        raise ValueError(f"needed is a finite history [T, pages] of angles in rad, not {list(angles.shape)}")
     over = angles > turned
     steps, pages = np.nonzero(over[1:] & ~over[:-1])  # in the order of time
     steps = steps + 1
-    hold = round(stay / dt)
+    hold = round(min(stay / dt, len(angles)))
     stays = np.array([over[t : t + hold + 1, i].all() for t, i in zip(steps, pages, strict=True)], dtype=bool)
     steps, pages = steps[stays], pages[stays]
     events, first = np.zeros(len(steps), dtype=np.int64), 0

@@ -15,6 +15,9 @@ from torch import Tensor
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.modules import set_recurrent_mode
 
+from torchrl_tsallis._checks import check_instance
+from torchrl_tsallis.modules.settings import check_key
+
 Key = tuple[str, ...]
 _DEFAULT = "let the module start from zeros where it finds none, as TorchRL's LSTMModule does"
 
@@ -61,6 +64,10 @@ class ActorPolicy:
         observation_key: NestedKey | None = None,
         action_key: NestedKey | None = None,
     ) -> None:
+        check_instance("actor", actor, TensorDictModuleBase, "a TensorDictModule, such as make_policy's actor")
+        for name, key in (("observation_key", observation_key), ("action_key", action_key)):
+            if key is not None:
+                check_key(name, key)
         inputs, outputs = ([_tuple(key) for key in keys] for keys in (actor.in_keys, actor.out_keys))
         self.actor = actor
         self.states = {key: ("next", *key) for key in inputs if ("next", *key) in outputs}

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from torchrl_tsallis._checks import check_number, shown
 from torchrl_tsallis.data.policy import as_observation, as_weights
 
 _LAYOUT = (
@@ -44,6 +45,8 @@ class MeanPolicy:
         eps: float = float(np.finfo(np.float32).eps),
     ) -> None:
         self.layers: list[tuple[np.ndarray, np.ndarray, np.ndarray | None]] = []
+        if not isinstance(layers, (list, tuple)) or not all(isinstance(x, tuple) and len(x) == 3 for x in layers):
+            raise TypeError(f"layers must be a list of tuples (weight, bias, norm or None), got {shown(layers)}")
         width = None
         for i, (w, b, norm) in enumerate(layers):
             weight, bias = as_weights(f"the weight of layer {i}", w), as_weights(f"the bias of layer {i}", b)
@@ -57,7 +60,7 @@ class MeanPolicy:
             width = len(weight)
         if not layers or not width or width % 2:
             raise ValueError("the last layer must give mean and scale, an even number of outputs; check the layers")
-        self.eps = eps
+        self.eps = check_number("eps", eps, low=0)
 
     @classmethod
     def from_actor_state(cls, state: Mapping[str, Any], eps: float | None = None) -> MeanPolicy:

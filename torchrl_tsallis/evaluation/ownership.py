@@ -53,7 +53,7 @@ def as_policy(name: str, given: Any) -> Policy:
         if callable(given) and not isinstance(given, type):
             return given
         if isinstance(given, Mapping):
-            return MeanPolicy.from_actor_state(given)
+            return MeanPolicy.from_actor_state(dict(given.items()))
     except (KeyError, ValueError) as error:
         raise type(error)(f"policy {name!r}: {error.args[0] if error.args else error}") from error
     kind = f"the class {given.__name__}" if isinstance(given, type) else f"an {type(given).__name__}"

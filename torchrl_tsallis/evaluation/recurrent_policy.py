@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from torchrl_tsallis._checks import check_number, shown
 from torchrl_tsallis.data.policy import as_observation, as_weights
 
 _LSTM = ("weight_ih", "weight_hh", "bias_ih", "bias_hh")
@@ -46,7 +47,12 @@ class RecurrentMeanPolicy:
         action_unit: float,
     ) -> None:
         self.mean, self.std = as_weights("observation_mean", mean), as_weights("observation_std", std)
-        self.action_unit = np.float32(action_unit)
+        if not isinstance(layers, (list, tuple)) or not layers:
+            raise TypeError(f"layers must be a list of tuples (w_ih, w_hh, bias), at least one, got {shown(layers)}")
+        for name, part, size in (("head", head, 2), *((f"layers[{i}]", layer, 3) for i, layer in enumerate(layers))):
+            if not isinstance(part, (list, tuple)) or len(part) != size:
+                raise TypeError(f"{name} must be a tuple of {size} arrays, got {shown(part)}")
+        self.action_unit = np.float32(check_number("action_unit", action_unit))
         self.layers, width = [], len(np.atleast_1d(self.mean))
         _check_shape("observation_mean", self.mean, (width,))
         _check_shape("observation_std", self.std, (width,))

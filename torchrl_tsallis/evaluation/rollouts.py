@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from torchrl_tsallis._checks import check_flag
 from torchrl_tsallis.evaluation.episodes import (
     MAX_STEPS,
     EnvFn,
@@ -80,10 +81,11 @@ def evaluate_policies(
         ...
         ValueError: episodes must be a whole number of at least 1, got episodes=0
     """
-    if not isinstance(policies, Mapping) or not policies:
+    if not isinstance(policies, Mapping) or not len(policies):
         raise ValueError(f"policies must be a mapping, name -> policy, of at least one; got {type(policies).__name__}")
     episodes, seed = whole_number("episodes", episodes, 1), whole_number("seed", seed, 0)
     workers, retries = whole_number("workers", workers, 0), whole_number("retries", retries, 0)
+    check_flag("progress", progress)
     max_steps, env_fn = whole_number("max_steps", max_steps, 1), checked_env_fn(env_fn)
     ready: dict[str, Policy] = {name: as_policy(name, policy) for name, policy in policies.items()}
     tasks = [(name, episode) for name in ready for episode in range(episodes)]

@@ -6,6 +6,8 @@ import math
 import numbers
 from typing import Any
 
+from torchrl_tsallis._checks import shown
+
 
 def whole_number(name: str, value: Any, least: int) -> int:
     """Checks a whole number.
@@ -27,8 +29,8 @@ def whole_number(name: str, value: Any, least: int) -> int:
         ...
         ValueError: episodes must be a whole number of at least 1, got episodes=2.5
     """
-    if isinstance(value, bool) or not isinstance(value, numbers.Integral) or value < least:
-        raise ValueError(f"{name} must be a whole number of at least {least}, got {name}={value!r}")
+    if isinstance(value, bool) or not isinstance(value, numbers.Integral) or not least <= int(value) < 2**63:
+        raise ValueError(f"{name} must be a whole number of at least {least}, got {name}={shown(value)}")
     return int(value)
 
 
@@ -52,6 +54,10 @@ def positive_number(name: str, value: Any) -> float:
         ValueError: fps must be a positive number, got fps=nan
     """
     good = isinstance(value, numbers.Real) and not isinstance(value, bool)
-    if not good or not math.isfinite(value) or value <= 0:
-        raise ValueError(f"{name} must be a positive number, got {name}={value!r}")
-    return float(value)
+    try:
+        number = float(value) if good else math.nan
+    except OverflowError:  # an integer beyond the floats
+        number = math.inf
+    if not 0 < number < math.inf:
+        raise ValueError(f"{name} must be a positive number, got {name}={shown(value)}")
+    return number

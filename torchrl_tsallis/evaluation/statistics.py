@@ -8,18 +8,32 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from torchrl_tsallis._checks import check_callable, check_number, check_seed, shown
+from torchrl_tsallis.evaluation.settings import whole_number
+
 
 def _checked(values: ArrayLike, name: str) -> np.ndarray:
     """Returns a float64 array that is not empty and has no NaN."""
+    message = f"{name} must be a rectangular array of numbers (as many episodes a seed)"
     try:
-        array = np.asarray(values, dtype=np.float64)
-    except ValueError as error:
-        raise ValueError(f"{name} must be a rectangular array of numbers (as many episodes a seed)") from error
+        given = np.asarray(values)
+        if given.dtype.kind not in "fiub":  # NumPy makes numbers of text and None
+            raise ValueError(message)
+        array = given.astype(np.float64)
+    except Exception as error:  # whatever an object that is no array raises
+        raise ValueError(f"{message}, got {shown(values)}") from error
     if array.size == 0:
         raise ValueError(f"{name} is empty: no episode was given")
     if np.isnan(array).any():
         raise ValueError(f"{name} has NaN at index {tuple(map(int, np.argwhere(np.isnan(array))[0]))}")
     return array
+
+
+def _checked_seed(confidence: float, resamples: int, seed: int) -> int:
+    """The seed of a bootstrap, all of whose settings are checked."""
+    check_number("confidence", confidence, above=0, below=1)
+    whole_number("resamples", resamples, 1)
+    return check_seed("seed", seed, low=0)
 
 
 def median(values: ArrayLike) -> float:
@@ -86,8 +100,10 @@ def bootstrap_interval(
         {'value': 1.0, 'low': 1.0, 'high': 1.0, 'unit': 'seed', 'n': 2}
     """
     array = _checked(scores, "scores")
-    if not 1 <= array.ndim <= 3 or not 0 < confidence < 1 or resamples < 1:
-        raise ValueError(f"need scores [S], [S, E] or [T, S, E], got {array.shape}; {confidence=}, {resamples=}")
+    seed = _checked_seed(confidence, resamples, seed)
+    check_callable("statistic", statistic, "makes a number of an array")
+    if not 1 <= array.ndim <= 3:
+        raise ValueError(f"need scores [S], [S, E] or [T, S, E], got {array.shape}")
     if array.ndim < 3:
         array = array.reshape(1, array.shape[0], -1)
     unit = "seed" if array.shape[1] > 1 else "episode"
@@ -96,6 +112,7 @@ def bootstrap_interval(
     tasks, n, _ = array.shape
     rng = np.random.default_rng(seed)
     rows = np.arange(tasks)[:, None]
+    check_number("statistic(scores)", statistic(array), finite=False)
     draws = [statistic(array[rows, rng.integers(n, size=(tasks, n))]) for _ in range(resamples)]
     low, high = np.quantile(draws, [(1 - confidence) / 2, (1 + confidence) / 2])
     return {"value": float(statistic(array)), "low": float(low), "high": float(high), "unit": unit, "n": n}
@@ -143,7 +160,9 @@ def probability_of_improvement(x: ArrayLike, y: ArrayLike) -> float:
     """
     a, b = _checked(x, "x"), _checked(y, "y")
     if a.ndim != 1 or b.ndim != 1:
-        raise ValueError(f"need one score a seed, got shapes {a.shape} and {b.shape}: reduce over episodes first")
+        raise ValueError(
+            f"need one score a seed of x and y, got shapes {a.shape} and {b.shape}: reduce over episodes first"
+        )
     return auroc(a, b)
 
 
@@ -172,10 +191,9 @@ def improvement_interval(
         {'value': 1.0, 'low': 1.0, 'high': 1.0}
     """
     a, b = np.atleast_2d(_checked(x, "x")), np.atleast_2d(_checked(y, "y"))
-    if a.ndim != 2 or b.ndim != 2 or len(a) != len(b) or not 0 < confidence < 1 or resamples < 1:
-        raise ValueError(
-            f"need [S] or [T, S] of as many tasks, got {a.shape} and {b.shape}; {confidence=}, {resamples=}"
-        )
+    seed = _checked_seed(confidence, resamples, seed)
+    if a.ndim != 2 or b.ndim != 2 or len(a) != len(b):
+        raise ValueError(f"x and y must be [S] or [T, S] of as many tasks, got {a.shape} and {b.shape}")
     wins = (a[:, :, None] > b[:, None]) + 0.5 * (a[:, :, None] == b[:, None])  # [T, S, S']
     rng = np.random.default_rng(seed)
     tasks = np.arange(len(a))[:, None, None]

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from torchrl_tsallis._checks import check_path, shown
 from torchrl_tsallis.evaluation.episodes import EnvFn, resolve
 from torchrl_tsallis.evaluation.interface import ActionRule, begin, name_of, observation_shape, take
 from torchrl_tsallis.evaluation.ownership import act, as_policy, left_as_found, own_copy
@@ -64,9 +65,9 @@ def record_rollout(
         ...
         ValueError: cannot write 'robot.avi': use .gif or .mp4
     """
-    target = Path(path)
+    target = Path(check_path("path", path))
     if target.suffix.lower() not in WRITERS:
-        raise ValueError(f"cannot write {str(target)!r}: use .gif or .mp4")
+        raise ValueError(f"cannot write {shown(str(path))}: use .gif or .mp4")
     module, package, write = WRITERS[target.suffix.lower()]
     seconds, fps, seed = positive_number("seconds", seconds), positive_number("fps", fps), whole_number("seed", seed, 0)
     if step_seconds is not None:
@@ -75,7 +76,7 @@ def record_rollout(
         raise ValueError(f"a .gif has at most 100 frames a second, got fps={fps:g}: choose less, or .mp4")
     if size is not None:
         if not isinstance(size, (tuple, list)) or len(size) != 2:
-            raise ValueError(f"size must be (width, height) in pixels, got {size!r}")
+            raise ValueError(f"size must be (width, height) in pixels, got {shown(size)}")
         size = whole_number("width", size[0], 16), whole_number("height", size[1], 16)
     if importlib.util.find_spec(module) is None:
         raise ImportError(f"writing {target.suffix} needs {package}: pip install {package}")

@@ -17,7 +17,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
-from torchrl_tsallis._checks import check_number
+from torchrl_tsallis._checks import check_callable, check_flag, check_instance, check_number, check_text
 
 Job = TypeVar("Job")
 Result = TypeVar("Result")
@@ -222,7 +222,13 @@ def run_jobs(
     from tqdm import tqdm
 
     _end_if_unguarded()
+    check_callable("function", function, "does a job")
+    check_instance("jobs", jobs, Sequence, "a sequence of jobs")
     check_number("workers", workers, low=0, integer=True)
+    check_number("total", total, low=0, integer=True)
+    check_text("desc", desc)
+    check_text("unit", unit)
+    check_flag("progress", progress)
     with tqdm(total=total, desc=desc, unit=unit, disable=not progress) as bar:
         if workers == 0:
             global _QUEUE

@@ -7,7 +7,8 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from torchrl_tsallis.modules.settings import check_dims
+from torchrl_tsallis._checks import check_flag, shown
+from torchrl_tsallis.modules.settings import check_dims, memory_for
 
 
 class Linear(nn.Linear):
@@ -36,7 +37,12 @@ class Linear(nn.Linear):
 
     def __init__(self, in_features: int, out_features: int, **kwargs: Any) -> None:
         check_dims(in_features=in_features, out_features=out_features)
-        super().__init__(in_features, out_features, **kwargs)
+        check_flag("bias", kwargs.get("bias", True))
+        dtype = kwargs.get("dtype")
+        if dtype is not None and not (isinstance(dtype, torch.dtype) and dtype.is_floating_point):
+            raise TypeError(f"dtype must be a floating-point dtype such as torch.float32, got {shown(dtype)}")
+        with memory_for(in_features=in_features, out_features=out_features):
+            super().__init__(int(in_features), int(out_features), **kwargs)
 
     def forward(self, x: Tensor) -> Tensor:
         """Maps ``[*B, in]`` to ``[*B, out]``."""

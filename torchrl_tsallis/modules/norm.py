@@ -9,6 +9,7 @@ from torch import Tensor, nn
 
 from torchrl_tsallis._checks import check_number
 from torchrl_tsallis.modules.numerics import is_traced, widened
+from torchrl_tsallis.modules.settings import memory_for
 
 
 class _RMSNorm(torch.autograd.Function):
@@ -75,7 +76,9 @@ class RMSNorm(nn.RMSNorm):
 
     def __init__(self, size: int, eps: float | None = None) -> None:
         size = int(check_number("size", size, low=1, integer=True))
-        super().__init__(size, None if eps is None else check_number("eps", eps, low=0))
+        eps = None if eps is None else check_number("eps", eps, low=0)
+        with memory_for(size=size):
+            super().__init__(size, eps)
 
     def forward(self, x: Tensor) -> Tensor:
         """Normalises ``[*B, size]``."""

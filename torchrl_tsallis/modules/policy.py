@@ -10,12 +10,12 @@ from tensordict.utils import NestedKey
 from torch import Tensor, nn
 from torchrl.modules import IndependentNormal, ProbabilisticActor
 
-from torchrl_tsallis._checks import check_number
+from torchrl_tsallis._checks import check_number, shown
 from torchrl_tsallis.modules.activations import Squish, squareplus
 from torchrl_tsallis.modules.linear import Linear
 from torchrl_tsallis.modules.norm import RMSNorm
 from torchrl_tsallis.modules.numerics import is_traced, widened
-from torchrl_tsallis.modules.settings import check_dims, check_key
+from torchrl_tsallis.modules.settings import check_dims, check_key, memory_for
 
 
 class NormalHead(nn.Module):
@@ -90,16 +90,17 @@ def make_policy(
         >>> make_policy(28, 8)(TensorDict({"observation": torch.zeros(3, 28)}, [3]))["action"].shape
         torch.Size([3, 8])
     """
-    if isinstance(hidden, str) or not isinstance(hidden, Sequence):
-        raise TypeError(f"hidden must be a sequence of widths, one a hidden layer, got {hidden!r}")
+    if isinstance(hidden, (str, bytes)) or not isinstance(hidden, Sequence):
+        raise TypeError(f"hidden must be a sequence of widths, one a hidden layer, got {shown(hidden)}")
     check_dims(obs_dim=obs_dim, **{f"hidden[{i}]": n for i, n in enumerate(hidden)}, action_dim=action_dim)
     sizes = [int(n) for n in (obs_dim, *hidden)]
     check_key("observation_key", observation_key)
     check_key("action_key", action_key)
     layers: list[nn.Module] = []
-    for n_in, n_out in zip(sizes[:-1], sizes[1:], strict=True):
-        layers += [Linear(n_in, n_out), RMSNorm(n_out), Squish()]
-    network = nn.Sequential(*layers, Linear(sizes[-1], 2 * int(action_dim)), NormalHead())
+    with memory_for(obs_dim=obs_dim, hidden=hidden, action_dim=action_dim):
+        for n_in, n_out in zip(sizes[:-1], sizes[1:], strict=True):
+            layers += [Linear(n_in, n_out), RMSNorm(n_out), Squish()]
+        network = nn.Sequential(*layers, Linear(sizes[-1], 2 * int(action_dim)), NormalHead())
     return ProbabilisticActor(
         TensorDictModule(network, in_keys=[observation_key], out_keys=["loc", "scale"]),
         in_keys=["loc", "scale"],

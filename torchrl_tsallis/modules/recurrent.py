@@ -11,9 +11,11 @@ from torchrl.modules import IndependentNormal, LSTMModule, ProbabilisticActor
 
 from torchrl_tsallis._checks import check_number
 from torchrl_tsallis.modules.policy import NormalHead
-from torchrl_tsallis.modules.settings import check_dims, check_key
+from torchrl_tsallis.modules.settings import check_dims, check_key, memory_for
 
 State = tuple[Tensor, Tensor]
+#: Layers that are made one by one, so that a slip of the pen would be waited for without end.
+MOST_LAYERS = 1000
 
 
 class NoisyLSTM(nn.LSTM):
@@ -48,7 +50,9 @@ class NoisyLSTM(nn.LSTM):
     def __init__(self, input_size: int, hidden_size: int, num_layers: int = 1, *, state_noise: float = 1e-3) -> None:
         check_dims(input_size=input_size, hidden_size=hidden_size, num_layers=num_layers)
         state_noise = check_number("state_noise", state_noise, low=0)
-        super().__init__(input_size, hidden_size, num_layers, batch_first=True)
+        check_number("num_layers", num_layers, high=MOST_LAYERS, integer=True)
+        with memory_for(input_size=input_size, hidden_size=hidden_size, num_layers=num_layers):
+            super().__init__(int(input_size), int(hidden_size), int(num_layers), batch_first=True)
         self.state_noise = state_noise
 
     def forward(  # type: ignore[override]
@@ -168,12 +172,15 @@ def make_recurrent_policy(
     check_key("action_key", action_key)
     if prediction_key is not None:
         check_key("prediction_key", prediction_key)
-    lstm = LSTMModule(
-        lstm=NoisyLSTM(obs_dim, hidden_size, num_layers, state_noise=state_noise),
-        in_key=observation_key,
-        out_key="features",
-    )
-    head = nn.Sequential(nn.Linear(hidden_size, 2 * action_dim), NormalHead(min_scale))
+    check_number("num_layers", num_layers, high=MOST_LAYERS, integer=True)
+    obs_dim, action_dim, hidden_size = int(obs_dim), int(action_dim), int(hidden_size)
+    with memory_for(obs_dim=obs_dim, hidden_size=hidden_size, action_dim=action_dim):
+        lstm = LSTMModule(
+            lstm=NoisyLSTM(obs_dim, hidden_size, num_layers, state_noise=state_noise),
+            in_key=observation_key,
+            out_key="features",
+        )
+        head = nn.Sequential(nn.Linear(hidden_size, 2 * action_dim), NormalHead(min_scale))
     parts = [lstm, TensorDictModule(head, in_keys=["features"], out_keys=["loc", "scale"])]
     if prediction_key is not None:
         predictor = nn.Linear(hidden_size, obs_dim)

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.modules import set_recurrent_mode
 
-from torchrl_tsallis._checks import check_number
+from torchrl_tsallis._checks import check_number, shown
 from torchrl_tsallis.ratings.base import Evidence, Rated, Rating
 from torchrl_tsallis.ratings.batch import Batch
 from torchrl_tsallis.ratings.normal import diagonal_normal, squared_distance, surprise_of
@@ -128,6 +128,8 @@ class AskedLoss:
         **options: Any,
     ) -> Tensor:
         """An answer about every sample, ``[*B]``, in evaluation mode; NaN where the mask leaves a sample out."""
+        if not isinstance(tensordict, TensorDictBase):
+            raise TypeError(f"tensordict must be a TensorDict of samples, got {shown(tensordict)}")
         with evaluating(self, *self._networks_asked):  # type: ignore[arg-type]
             dim = 0 if self.num_members is None else 1
             if chunk_size is None or tensordict.ndim <= dim:

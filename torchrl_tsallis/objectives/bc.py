@@ -13,6 +13,7 @@ from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor
 from torchrl.objectives.common import LossModule
 
+from torchrl_tsallis._checks import check_choice, check_flag
 from torchrl_tsallis.objectives.actor import own_parameters
 from torchrl_tsallis.objectives.asking import AskedLoss
 from torchrl_tsallis.objectives.inputs import check_actors, check_key
@@ -137,8 +138,8 @@ class TsallisBCLoss(ActorPasses, AskedLoss, LossModule):
         super().__init__()
         members = check_actors(actor_network)
         self.num_members = None if members is None else len(members)
-        if reduction not in (None, "mean", "sum", "none"):
-            raise ValueError(f"reduction must be 'mean', 'sum' or 'none', got {reduction!r}")
+        if reduction is not None:
+            check_choice("reduction", reduction, ("mean", "sum", "none"))
         if rating is not None and tsallis:
             raise ValueError(
                 f"{', '.join(tsallis)} are settings of TsallisRating: give them to the rating, or no rating"
@@ -159,7 +160,7 @@ class TsallisBCLoss(ActorPasses, AskedLoss, LossModule):
         self.rating_module = rating
         self._in_keys: list[NestedKey] | None = None
         self.reduction = reduction or "mean"
-        self.sync_stats = sync_stats
+        self.sync_stats = check_flag("sync_stats", sync_stats)
         self.process_group = process_group
         member_loss = ["member_loss"] if members and self.reduction != "none" else []
         self.out_keys = ["loss_tsallis_bc", *rating.logged, *_STATISTICS, *member_loss]

@@ -11,11 +11,14 @@ from torchrl._utils import logger
 from torchrl.objectives.common import LossModule
 from torchrl.objectives.utils import TargetNetUpdater
 
-from torchrl_tsallis._checks import check_number
+from torchrl_tsallis._checks import check_choice, check_number, shown
 from torchrl_tsallis.objectives.cat_group import CATGroup
 from torchrl_tsallis.objectives.replaced import LoadWatch
 
 __all__ = ["CATSoftUpdate"]
+
+#: What float32 still holds, and its square too.
+LARGEST = 1e19
 
 
 class CATSoftUpdate(TargetNetUpdater):
@@ -84,10 +87,12 @@ class CATSoftUpdate(TargetNetUpdater):
             raise TypeError(f"loss_module must be a loss, as TsallisBCLoss, got {type(loss_module).__name__}")
         tau = check_number("tau", tau, low=0, high=1)
         strength = check_number("strength", strength, low=0, high=1)
-        eps = check_number("eps", eps, above=0)
+        eps = float(check_number("eps", eps, above=0, high=LARGEST))
         k = check_number("k", k, above=0, finite=False)  # inf switches the robustness off
-        if init_scale not in ("first", "eps"):
-            raise ValueError(f"init_scale must be 'first' or 'eps', got {init_scale!r}")
+        if LARGEST < k < float("inf"):
+            raise ValueError(f"k must be at most {LARGEST:g}, or inf, got {shown(k)}")
+        k = float(k)
+        check_choice("init_scale", init_scale, ("first", "eps"))
         self.tau, self.strength, self.eps, self.k, self.init_scale = tau, strength, eps, k, init_scale
         self._groups: dict[str, CATGroup] = {}
         self._before: dict[str, dict[str, Any]] | None = None  # what was there before a load, until the next step

@@ -12,7 +12,7 @@ from tensordict.utils import NestedKey, expand_right, unravel_key
 from torch import Tensor
 from torch.distributions import Distribution
 
-from torchrl_tsallis._checks import check_number
+from torchrl_tsallis._checks import check_flag, check_number
 from torchrl_tsallis.objectives.bc import TsallisBCLoss
 from torchrl_tsallis.ratings.base import Evidence, Rated
 
@@ -88,7 +88,8 @@ class PredictiveBCLoss(TsallisBCLoss):
         rate_prediction: bool = False,
         **settings: Any,
     ) -> None:
-        check_number("prediction_weight", prediction_weight, low=0)
+        prediction_weight = check_number("prediction_weight", prediction_weight, low=0)
+        check_flag("rate_prediction", rate_prediction)
         super().__init__(actor_network, **settings)
         if self.num_members is not None:
             raise ValueError("PredictiveBCLoss has one policy: torch.vmap cannot stack LSTM layers")

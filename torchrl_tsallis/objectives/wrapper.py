@@ -13,9 +13,9 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.objectives.common import LossModule
 
-from torchrl_tsallis._checks import check_number
+from torchrl_tsallis._checks import check_choice, check_flag, check_number, shown
 from torchrl_tsallis.objectives.asking import AskedLoss
-from torchrl_tsallis.objectives.inputs import mask_of
+from torchrl_tsallis.objectives.inputs import check_key, mask_of
 from torchrl_tsallis.objectives.samples import (
     action_dims,
     losses_of_samples,
@@ -145,9 +145,9 @@ class RatedLoss(WrappedLoss, AskedLoss, LossModule):
                 f"{kind}(..., reduction='none')"
             )
         if not isinstance(rating, PeakRating | None):
-            raise TypeError(f"RatedLoss takes a PeakRating, got {rating!r}")
-        if reduction not in (None, "mean", "sum", "none"):
-            raise ValueError(f"reduction must be 'mean', 'sum' or 'none', got {reduction!r}")
+            raise TypeError(f"RatedLoss takes a PeakRating as rating, got {shown(rating)}")
+        if reduction is not None:
+            check_choice("reduction", reduction, ("mean", "sum", "none"))
         self.loss_module = loss_module
         self.rating_module = PeakRating() if rating is None else rating
         self.rating_module.stack(None)
@@ -155,8 +155,9 @@ class RatedLoss(WrappedLoss, AskedLoss, LossModule):
         self.dims = None if dims is None else check_number("dims", dims, above=0)
         self.draws = int(check_number("draws", draws, low=0, integer=True))
         self.reduction = reduction or "mean"
-        self.sync_stats = sync_stats
+        self.sync_stats = check_flag("sync_stats", sync_stats)
         self.process_group = process_group
+        check_key("loss_key", loss_key)
         self.loss_key = self._only_loss() if loss_key is None else loss_key
         others = [self._name(key) for key in loss_module.out_keys if key != self.loss_key]
         self.out_keys = [self.loss_key, *self.rating_module.logged, *_STATISTICS, *others]

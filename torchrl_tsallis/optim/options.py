@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterable, Sequence
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -34,7 +35,7 @@ def check_params(params: Any) -> list[Any]:
         ValueError: params is empty: pass the parameters that are trained, as loss.parameters()
     """
     wanted = "params must be the parameters that are trained, as loss.parameters(), or groups of them, {'params': ...}"
-    if isinstance(params, (Tensor, nn.Module, str, dict)) or not isinstance(params, Iterable):
+    if isinstance(params, (Tensor, np.ndarray, nn.Module, str, dict)) or not isinstance(params, Iterable):
         raise TypeError(f"{wanted}, got {'None' if params is None else type(params).__name__}")
     params = list(params)
     if not params:

@@ -6,10 +6,12 @@ from collections.abc import Sequence
 from numbers import Real
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 from torch.distributions import Distribution
 
+from torchrl_tsallis._checks import shown
 from torchrl_tsallis.ratings.batch import Batch
 from torchrl_tsallis.ratings.normal import diagonal_normal, scale_weighted_log_prob
 
@@ -223,6 +225,11 @@ class Rating(nn.Module):
         raise NotImplementedError
 
 
+def _within(x: Any, low: float, high: float) -> bool:
+    """Whether a number is in [low, high]; integers beyond the floats are compared as they are."""
+    return low <= x <= high
+
+
 def as_numbers(name: str, value: Any, low: float, high: float) -> float | list[float]:
     """A setting as a number in [low, high], or a list of them.
 
@@ -246,12 +253,13 @@ def as_numbers(name: str, value: Any, low: float, high: float) -> float | list[f
         ...
         ValueError: q must be a number in [0, 1], or a sequence of one for each stacked member, got None
     """
-    plain: Any = value.tolist() if isinstance(value, Tensor) else value
+    plain: Any = value.tolist() if isinstance(value, (Tensor, np.ndarray)) else value
     many = isinstance(plain, Sequence) and not isinstance(plain, str)
     numbers: list[Any] = list(plain) if many else [plain]
-    valid = [isinstance(x, Real) and not isinstance(x, bool) and low <= float(x) <= high for x in numbers]
+    valid = [isinstance(x, Real) and not isinstance(x, bool) and _within(x, low, high) for x in numbers]
     if numbers and all(valid):
         return [float(x) for x in numbers] if many else float(plain)
     raise ValueError(
-        f"{name} must be a number in [{low:g}, {high:g}], or a sequence of one for each stacked member, got {value!r}"
+        f"{name} must be a number in [{low:g}, {high:g}], or a sequence of one for each stacked member, got "
+        f"{shown(value)}"
     )

@@ -136,8 +136,10 @@ class ScoreTuner(RatingTuner):
         optimizer: MakeOptimizer | None = None,
     ) -> None:
         self.u_max = check_number("u_max", u_max, above=0, below=1)
-        check_number("lr", lr, low=0)
-        super().__init__(loss, tuned=tuned, optimizer=optimizer or (lambda params: torch.optim.Adam(params, lr=lr)))
+        lr = check_number("lr", lr, low=0)
+        if optimizer is None:
+            optimizer = lambda params: torch.optim.Adam(params, lr=lr)  # noqa: E731
+        super().__init__(loss, tuned=tuned, optimizer=optimizer)
 
     def start(self) -> Tensor:
         """See :meth:`RatingTuner.start`: the phi of the rating's own u."""
@@ -145,7 +147,7 @@ class ScoreTuner(RatingTuner):
         inside = (share > 0) & (share < 1)
         if not bool((inside if self.tuned is None else inside | ~self.tuned).all()):
             raise ValueError(
-                f"a tuned u must start in (0, {self.u_max:g}), the bounds of ScoreTuner, got {self.rating.u}"
+                f"a tuned u must start in (0, {self.u_max:g}), the bound u_max of ScoreTuner, got {self.rating.u}"
             )
         return share.where(inside, 0.5).logit()
 

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor, nn
 from torchrl.trainers import Trainer, TrainerHookBase
 
+from torchrl_tsallis._checks import check_callable, shown
 from torchrl_tsallis.ratings.base import Rating
 from torchrl_tsallis.ratings.batch import Batch
 
@@ -54,14 +55,22 @@ class RatingTuner(TrainerHookBase):
                 f"{name} tunes {self.rating_class.__name__}, the loss has {type(rating).__name__}: {advice}"
             )
         members = loss.num_members
-        if tuned is not None and len(tuned) != members:
-            raise ValueError(f"tuned has {len(tuned)} values for {members or 'no'} stacked members")
+        if tuned is not None:
+            flags = tuned.tolist() if isinstance(tuned, Tensor) else tuned
+            if not isinstance(flags, Sequence) or not all(isinstance(flag, bool) for flag in flags):
+                raise TypeError(f"tuned must be a sequence of True or False, one a stacked member, got {shown(tuned)}")
+            if len(flags) != members:
+                raise ValueError(f"tuned has {len(flags)} values for {members or 'no'} stacked members")
+            tuned = flags
+        check_callable("optimizer", optimizer, "makes an optimizer from a list of parameters")
         self.loss = loss
         self.rating: Any = rating
         like = rating.beta
         self.tuned = None if tuned is None or all(tuned) else torch.tensor(list(map(bool, tuned)), device=like.device)
         self.phi = nn.Parameter(self.start().to(like))
         self.optimizer = optimizer([self.phi])
+        if not isinstance(self.optimizer, torch.optim.Optimizer):
+            raise TypeError(f"optimizer must make an Optimizer of torch, it made {shown(self.optimizer)}")
         self._write()
 
     def start(self) -> Tensor:

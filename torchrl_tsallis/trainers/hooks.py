@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from torchrl.checkpoint import GlobalRNGState
 from torchrl.trainers import Trainer, TrainerHookBase
 
-from torchrl_tsallis._checks import check_number
+from torchrl_tsallis._checks import check_number, check_text, shown
 
 _MANY = 100  # members of a container; one with more is data
 
@@ -100,10 +100,10 @@ class EvaluationHook(TrainerHookBase):
         patience: int | None = None,
     ) -> None:
         if not callable(evaluate):
-            raise TypeError(f"evaluate must be a callable that returns results by name, got {evaluate!r}")
+            raise TypeError(f"evaluate must be a callable that returns results by name, got {shown(evaluate)}")
         self.evaluate = evaluate
         self.every = int(check_number("every", every, low=1, integer=True))
-        self.monitor = monitor
+        self.monitor = check_text("monitor", monitor)
         self.patience = None if patience is None else int(check_number("patience", patience, low=1, integer=True))
         self.best = -math.inf
         self.without_best = 0

@@ -14,6 +14,7 @@ import numpy as np
 from torchrl.record.loggers.common import Logger
 from torchrl.record.loggers.csv import CSVLogger
 
+from torchrl_tsallis._checks import check_path, check_text, shown
 from torchrl_tsallis.jobs import atomic_path, check_writable, disk_errors
 from torchrl_tsallis.trainers.log_adapters import adapter_of, sorted_columns
 from torchrl_tsallis.trainers.log_base import LogAdapter
@@ -41,9 +42,14 @@ def check_name(name: str, *, what: str = "name") -> str:
         'eval/return'
     """
     parts = name.split("/") if isinstance(name, str) else [""]
-    if any(part in ("", ".", "..") for part in parts) or set(name) & set("\\\0") or re.match("[A-Za-z]:", name):
+    if (
+        any(part in ("", ".", "..") for part in parts)
+        or len(name.encode(errors="replace")) > 1000
+        or set(name) & set("\\\0")
+        or re.match("[A-Za-z]:", name)
+    ):
         raise ValueError(
-            f"{what} {name!r} leads out of its folder: use letters, digits, and / between the parts of a quantity"
+            f"{what} {shown(name)} leads out of its folder: use letters, digits, and / between the parts of a quantity"
         )
     return name
 
@@ -67,8 +73,10 @@ class LoggerGroup(Logger):
     """
 
     def __init__(self, loggers: Sequence[Logger]) -> None:
+        if not isinstance(loggers, (list, tuple)) or not all(hasattr(logger, "log_scalar") for logger in loggers):
+            raise TypeError(f"loggers must be a list of TorchRL's loggers, got {shown(loggers)}")
         if not loggers:
-            raise ValueError("a group needs at least one logger")
+            raise ValueError("a group needs at least one logger: loggers is empty")
         self.loggers = list(loggers)
         self.adapters = [adapter_of(logger) for logger in loggers]
         super().__init__(self.loggers[0].exp_name, self.loggers[0].log_dir)
@@ -192,11 +200,16 @@ def make_logger(
         ...
         ValueError: no logger 'cvs': choose csv, tensorboard or wandb
     """
-    if kind not in ("csv", "tensorboard", "wandb"):
-        raise ValueError(f"no logger {kind!r}: choose csv, tensorboard or wandb")
+    if not isinstance(kind, str) or kind not in ("csv", "tensorboard", "wandb"):
+        raise ValueError(f"no logger {shown(kind)}: choose csv, tensorboard or wandb")
     if "/" in check_name(name, what="the run's name"):
         raise ValueError(f"the run's name {name!r} holds a /: put the folders above it into folder")
-    root = Path(folder)
+    check_text("project", project)
+    if group is not None:
+        check_text("group", group)
+    if not isinstance(tags, (list, tuple)) or not all(isinstance(tag, str) for tag in tags):
+        raise TypeError(f"tags must be a sequence of strings, got {shown(tags)}")
+    root = Path(check_path("folder", folder))
     check_writable(root / name)
     loggers: list[Logger] = [CSVLogger(name, str(root))]
     if kind == "tensorboard":

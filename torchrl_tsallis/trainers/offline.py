@@ -18,7 +18,7 @@ from torchrl.objectives.utils import TargetNetUpdater
 from torchrl.record.loggers.common import Logger
 from torchrl.trainers import Trainer, TrainerHookBase
 
-from torchrl_tsallis._checks import check_number
+from torchrl_tsallis._checks import check_flag, check_instance, check_number, check_path, shown
 from torchrl_tsallis._torchrl import own_log_times, sampler_rng
 from torchrl_tsallis.data.storage import single_precision
 from torchrl_tsallis.ratings.tuner import RatingTuner
@@ -38,6 +38,7 @@ class SampleHook(TrainerHookBase):
     """
 
     def __init__(self, replay_buffer: ReplayBuffer) -> None:
+        check_instance("replay_buffer", replay_buffer, ReplayBuffer, "a buffer such as make_replay_buffer(data)")
         self.replay_buffer = replay_buffer
         self._single = False
 
@@ -136,6 +137,20 @@ def make_offline_trainer(
         >>> trainer.collected_frames
         4
     """
+    check_instance("loss", loss, torch.nn.Module, "a loss such as TsallisBCLoss(actor)")
+    check_instance("replay_buffer", replay_buffer, ReplayBuffer, "a buffer such as make_replay_buffer(data)")
+    check_instance("optimizer", optimizer, torch.optim.Optimizer, "an optimizer such as AdaTerm(loss.parameters())")
+    for name, part, method in (
+        ("updater", updater, "step"),
+        ("tuner", tuner, "register"),
+        ("logger", logger, "log_scalar"),
+    ):
+        if part is not None and (isinstance(part, type) or not callable(getattr(part, method, None))):
+            raise TypeError(f"{name} must be an object with a method {method}(), or None, got {shown(part)}")
+    check_flag("overwrite", overwrite)
+    check_flag("progress", progress)
+    if checkpoint_dir is not None:
+        check_path("checkpoint_dir", checkpoint_dir)
     whole = {"steps": steps, "log_every": log_every, "checkpoint_every": checkpoint_every}
     for name, value in (whole | {"keep_checkpoints": keep_checkpoints}).items():
         check_number(name, value, low=1, integer=True)

@@ -10,6 +10,8 @@ import torch
 from torch.optim.lr_scheduler import LRScheduler, ReduceLROnPlateau
 from torchrl.trainers import Trainer, TrainerHookBase
 
+from torchrl_tsallis._checks import check_instance, shown
+
 #: Makes a schedule of an optimizer, as ``partial(CosineAnnealingLR, T_max=23400)``.
 MakeSchedule = Callable[[torch.optim.Optimizer], LRScheduler]
 
@@ -35,9 +37,10 @@ class ScheduleHook(TrainerHookBase):
     def __init__(self, make: MakeSchedule, optimizer: torch.optim.Optimizer) -> None:
         if not callable(make):
             raise TypeError(
-                f"lr_schedule must be a callable that makes a schedule from the optimizer, got {make!r}: pass "
+                f"lr_schedule must be a callable that makes a schedule from the optimizer, got {shown(make)}: pass "
                 "partial(CosineAnnealingLR, T_max=...), not the schedule itself"
             )
+        check_instance("optimizer", optimizer, torch.optim.Optimizer, "an optimizer such as AdaTerm(loss.parameters())")
         self.make, self.optimizer = make, optimizer
         self.schedule = self._made()
 

@@ -10,6 +10,7 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl.checkpoint import CheckpointRotation
 from torchrl.trainers import Trainer
 
+from torchrl_tsallis._checks import check_number
 from torchrl_tsallis._torchrl import advance_bar, stop_reason, withdraw_stop
 from torchrl_tsallis.jobs import check_writable
 from torchrl_tsallis.trainers.checkpoint_files import checkpoints_in, remove, remove_remains
@@ -33,7 +34,7 @@ class OfflineClock:
     init_random_frames = 0
 
     def __init__(self, steps: int) -> None:
-        self.steps = steps
+        self.steps = int(check_number("steps", steps, low=1, integer=True))
         self._trainer: Trainer | None = None
         self._stopped: str | None = None
 

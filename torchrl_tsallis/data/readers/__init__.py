@@ -12,6 +12,7 @@ from typing import Any
 import torch
 
 # Each import registers a format; a path looks like one of them at most.
+from torchrl_tsallis._checks import check_flag, check_path, shown
 from torchrl_tsallis.data.readers import lerobot as _lerobot  # noqa: F401
 from torchrl_tsallis.data.readers import minari as _minari  # noqa: F401
 from torchrl_tsallis.data.readers import npz as _npz  # noqa: F401
@@ -98,11 +99,11 @@ def open_reader(path: str | os.PathLike[str], options: Options | None = None, *,
         FileNotFoundError: if there is nothing at the path.
         ValueError: if no format is known for it, or it is broken.
     """
-    place = Path(path).expanduser()
-    if format is not None and format not in READERS:
-        raise ValueError(f"no format {format!r}: choose one of {', '.join(READERS)}")
+    place = Path(check_path("path", path)).expanduser()
+    if format is not None and (not isinstance(format, str) or format not in READERS):
+        raise ValueError(f"no format {shown(format)}: choose one of {', '.join(READERS)}")
     try:
-        if not place.exists():
+        if not os.path.exists(place):  # Path.exists() raises for a name that is too long
             raise FileNotFoundError(f"there is nothing at {str(place)!r}: give a file or folder of demonstrations")
         if format is not None:
             return READERS[format](place, options or Options())
@@ -211,6 +212,9 @@ def read_demonstrations(
         ('npz', ('0', '1'), [0, 0, 0, 1])
     """
     options = Options(observation, action, reward, episode, filter_key, images, next_observation, concatenate)
+    check_flag("check", check)
+    if dtype is not None and not (isinstance(dtype, torch.dtype) and dtype.is_floating_point):
+        raise TypeError(f"dtype must be a floating-point dtype such as torch.float32, or None, got {shown(dtype)}")
     found = open_reader(path, options, format=format).read()
     if dtype is not None and not is_memory_mapped(found.data):
         info = found.data.get("info", None)

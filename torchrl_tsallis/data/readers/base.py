@@ -18,6 +18,8 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 from tensordict import TensorDictBase
 
+from torchrl_tsallis._checks import check_flag
+
 
 @dataclass(frozen=True)
 class Options:
@@ -53,6 +55,8 @@ class Options:
         for name in ("reward", "episode", "filter_key"):
             if not isinstance(getattr(self, name), (str, type(None))):
                 raise TypeError(f"{name}={getattr(self, name)!r} must be a key of the file")
+        for name in ("images", "next_observation", "concatenate"):
+            check_flag(name, getattr(self, name))
 
 
 @dataclass(frozen=True)

@@ -5,9 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any, Literal
 
+import numpy as np
 import torch
 from torch import Tensor
 
+from torchrl_tsallis._checks import shown
 from torchrl_tsallis.ratings.base import Evidence, Rated, Rating, as_numbers
 from torchrl_tsallis.ratings.running import RunningMean
 from torchrl_tsallis.ratings.tsallis.equations import adaptive_gamma, bound_ratio, log_mixture, rated_value, rating
@@ -71,8 +73,7 @@ class TsallisRating(Rating):
         beta: float | Sequence[float] = 0.0,
     ) -> None:
         super().__init__(beta)
-        for name, value in (("gamma_min", gamma_min), ("gamma_max", gamma_max)):
-            as_numbers(name, value, 0, 1)
+        gamma_min, gamma_max = _bound("gamma_min", gamma_min), _bound("gamma_max", gamma_max)
         if not 0 < gamma_min <= gamma_max < 1:
             raise ValueError(f"0 < gamma_min <= gamma_max < 1 is needed, got {gamma_min=} and {gamma_max=}")
         self.add_setting("q", q, 0, 1)
@@ -158,15 +159,25 @@ class TsallisRating(Rating):
         return Rated(evidence.loss(value, weight), weight, log_prob, logged)
 
 
+def _bound(name: str, value: Any) -> float:
+    """A bound of the adaptive level: one number for all members."""
+    number = as_numbers(name, value, 0, 1)
+    if isinstance(number, list):
+        raise ValueError(f"{name} must be one number in [0, 1] for all members, got {shown(value)}")
+    return number
+
+
 def _levels(gamma_mix: Any, bound: float) -> Any:
     """Relative rating levels with a bound in the place of the adaptive ones."""
-    plain = gamma_mix.tolist() if isinstance(gamma_mix, Tensor) else gamma_mix
+    plain = gamma_mix.tolist() if isinstance(gamma_mix, (Tensor, np.ndarray)) else gamma_mix
     many = isinstance(plain, Sequence) and not isinstance(plain, str)
-    levels = [bound if level == "adaptive" else level for level in (plain if many else [plain])]
+    levels = [
+        bound if isinstance(level, str) and level == "adaptive" else level for level in (plain if many else [plain])
+    ]
     try:
         numbers = as_numbers("gamma_mix", levels if many else levels[0], 0, 1)
     except ValueError:
         raise ValueError(
-            f"gamma_mix must be 'adaptive' or a number in [0, 1], or a sequence, got {gamma_mix!r}"
+            f"gamma_mix must be 'adaptive' or a number in [0, 1], or a sequence, got {shown(gamma_mix)}"
         ) from None
     return numbers

@@ -190,12 +190,12 @@ class QTuner(RatingTuner):
         lr: float = 1e-3,
         optimizer: MakeOptimizer | None = None,
     ) -> None:
-        check_number("q_min", q_min, above=0, below=1)
-        self.q_min = q_min
+        self.q_min = check_number("q_min", q_min, above=0, below=1)
         self.multiplier = check_number("multiplier", multiplier, low=0)
-        check_number("lr", lr, low=0)
-        make = optimizer or (lambda params: AdaTerm(params, lr=lr, batch_dims=params[0].ndim))
-        super().__init__(loss, tuned=tuned, optimizer=make)
+        lr = check_number("lr", lr, low=0)
+        if optimizer is None:
+            optimizer = lambda params: AdaTerm(params, lr=lr, batch_dims=params[0].ndim)  # noqa: E731
+        super().__init__(loss, tuned=tuned, optimizer=optimizer)
         relative = self.rating.gamma_low == 1
         if bool((relative if self.tuned is None else relative & self.tuned).any()):
             raise ValueError(
