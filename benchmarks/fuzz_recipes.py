@@ -15,6 +15,8 @@ from fuzz_kinds import INFINITE
 from fuzz_table import Reached
 from hypothesis import strategies as st
 
+#: Options that may be null, though they are not by default.
+ABSENT = {"show"}
 #: Recipes, and where each begins with its data.
 RECIPES: dict[str, tuple[str, ...]] = {
     "ant_noise": ("demonstrations",),
@@ -99,6 +101,8 @@ def allowed(option: str, before: Any, value: Any) -> bool:
 
     if OmegaConf.is_config(value):
         value = OmegaConf.to_container(value)
+    if value is None and option in ABSENT:
+        return True
     if isinstance(before, bool):
         return isinstance(value, bool)
     if isinstance(before, Real):

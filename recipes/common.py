@@ -94,7 +94,7 @@ def differ(before: Any, wanted: Any) -> bool:
     """Whether settings differ; an option that one of the two versions of the package does not have does not count."""
     if isinstance(before, dict) and isinstance(wanted, dict):
         return any(differ(before[name], wanted[name]) for name in before.keys() & wanted.keys())
-    return before != wanted
+    return before != wanted and not (before != before and wanted != wanted)  # NaN is as it was
 
 
 def keep_settings(file: Path, settings: Mapping[str, Any], names: Sequence[str], way_out: str = "") -> None:

@@ -74,7 +74,7 @@ def get_dist(actor: ProbabilisticTensorDictSequential, inputs: TensorDictBase) -
         torch.Size([5])
     """
     parts = _network_and_head(actor)
-    with _named_inputs(actor, inputs):
+    with named_inputs(actor, inputs):
         if parts is None:
             return actor.get_dist(inputs.copy())
         network, head = parts
@@ -82,8 +82,12 @@ def get_dist(actor: ProbabilisticTensorDictSequential, inputs: TensorDictBase) -
 
 
 @contextmanager
-def _named_inputs(actor: Any, inputs: TensorDictBase) -> Iterator[None]:
+def named_inputs(actor: Any, inputs: TensorDictBase) -> Iterator[None]:
     """Says what a network was given that it could not take: torch only speaks of matrices.
+
+    Args:
+        actor: the network, with ``in_keys``.
+        inputs: what it is given.
 
     Raises:
         TypeError: if an input is of another type than the actor's parameters.
@@ -91,14 +95,20 @@ def _named_inputs(actor: Any, inputs: TensorDictBase) -> Iterator[None]:
     """
     try:
         yield
-    except (RuntimeError, IndexError) as error:
-        if isinstance(error, NotImplementedError) or torch.compiler.is_compiling():
+    except (RuntimeError, IndexError, TypeError, AttributeError, ValueError) as error:
+        if torch.compiler.is_compiling():
             raise
         wanted = {p.dtype for p in actor.parameters() if p.is_floating_point()}
-        given = {key: inputs.get(key) for key in actor.in_keys if isinstance(inputs.get(key, None), Tensor)}
-        listed = ", ".join(f"{key!r} {list(x.shape)} {x.dtype}" for key, x in given.items())
+        given = {key: inputs.get(key) for key in actor.in_keys if inputs.get(key, None) is not None}
+        odd = any(not isinstance(x, Tensor) or x.dtype not in wanted for x in given.values()) or not inputs.ndim
+        if isinstance(error, NotImplementedError) or not (odd or isinstance(error, (RuntimeError, IndexError))):
+            raise  # a fault of the network's own
+        listed = ", ".join(
+            f"{key!r} {list(x.shape)} {x.dtype if isinstance(x, Tensor) else type(x).__name__}"
+            for key, x in given.items()
+        )
         text = f"the actor cannot take {listed}"
-        if wanted and any(x.dtype not in wanted for x in given.values()):
+        if wanted and any(isinstance(x, Tensor) and x.dtype not in wanted | {torch.bool} for x in given.values()):
             names = ", ".join(map(str, wanted))
             raise TypeError(
                 f"{text}: its parameters are {names}; convert the data, or the actor, to one type"
@@ -142,7 +152,7 @@ def get_stacked_dist(
         raise NotImplementedError("stacked members need an actor with one distribution (return_composite=False)")
 
     if parts is not None and _is_stackable(parts[0].module):
-        with params.to_module(actor, preserve_module_state=False), _named_inputs(actor, inputs):
+        with params.to_module(actor, preserve_module_state=False), named_inputs(actor, inputs):
             return parts[1].get_dist(_call(parts[0], [inputs.get(key) for key in parts[0].in_keys]))
 
     def call(params: TensorDictBase, *given: Any) -> Any:
@@ -150,7 +160,7 @@ def get_stacked_dist(
             return actor.get_dist_params(*given) if parts is None else _call(parts[0], given)
 
     vectorized = torch.vmap(call, randomness=randomness)
-    with _named_inputs(actor, inputs):
+    with named_inputs(actor, inputs):
         if parts is None:
             return actor.build_dist_from_params(vectorized(params, inputs.copy()))
         return parts[1].get_dist(vectorized(params, *(inputs.get(key) for key in parts[0].in_keys)))
@@ -179,7 +189,15 @@ def log_prob_of(dist: Distribution, inputs: TensorDictBase, action_key: NestedKe
             f"{action_key!r} has shape {list(action.shape)}, the actor's distribution {list(expected)}: the two must "
             "be equal (check the actor's action_dim and the batch size)"
         )
-    log_prob = _safe_log_prob(dist, action)
+    try:
+        log_prob = _safe_log_prob(dist, action)
+    except (RuntimeError, TypeError) as error:
+        if action.dtype.is_floating_point or torch.compiler.is_compiling():
+            raise
+        raise TypeError(
+            f"{action_key!r} is {action.dtype}, of which the actor's {type(dist).__name__} has no density: convert the "
+            "data to the type of the actor's parameters"
+        ) from error
     shape, batch = log_prob.shape, inputs.batch_size
     # Without a batch size of its own the batch is what all inputs have in common, as for TorchRL's losses.
     fits = shape == batch if batch else all(x.shape[: len(shape)] == shape for x in inputs.values(True, True))

@@ -13,6 +13,7 @@ from torch import Tensor
 from torch.distributions import Distribution
 
 from torchrl_tsallis._checks import check_flag, check_number
+from torchrl_tsallis.objectives.actor import named_inputs
 from torchrl_tsallis.objectives.bc import TsallisBCLoss
 from torchrl_tsallis.ratings.base import Evidence, Rated
 
@@ -127,7 +128,10 @@ class PredictiveBCLoss(TsallisBCLoss):
     def _pass(self, inputs: TensorDictBase, params: TensorDictParams) -> tuple[Distribution, Tensor]:
         """As in the parent, and the prediction of the same pass."""
         written = inputs.copy()
-        with params.to_module(self.actor_network, preserve_module_state=False):
+        with (
+            params.to_module(self.actor_network, preserve_module_state=False),
+            named_inputs(self.actor_network, inputs),
+        ):
             dist = self.actor_network.get_dist(written)
         return dist, written.get(self.tensor_keys.prediction)
 

@@ -14,6 +14,7 @@ from torch import Tensor
 from torchrl.objectives.common import LossModule
 
 from torchrl_tsallis._checks import check_choice, check_flag, check_number, shown
+from torchrl_tsallis.objectives.actor import named_inputs
 from torchrl_tsallis.objectives.asking import AskedLoss
 from torchrl_tsallis.objectives.inputs import check_key, mask_of
 from torchrl_tsallis.objectives.samples import (
@@ -195,7 +196,8 @@ class RatedLoss(WrappedLoss, AskedLoss, LossModule):
         inputs, far = split_far(inputs, self.in_keys, batch.mask)
 
         def draw() -> tuple[Tensor, int, TensorDictBase]:
-            written = self.loss_module(inputs.copy())
+            with named_inputs(self.loss_module, inputs):
+                written = self.loss_module(inputs.copy())
             losses, elements = losses_of_samples(written, self.loss_key, inputs.shape, batch.mask)
             return losses.masked_fill(far, torch.inf), elements, written
 
