@@ -1,0 +1,17 @@
+"""Modes of behaviour in demonstrations, found without labels: mixtures of policies over whole episodes."""
+
+from torchrl_tsallis.modes.likelihood import episode_means, robust_log_prob
+from torchrl_tsallis.modes.mixture import EpisodeMixture
+from torchrl_tsallis.modes.responsibilities import Annealing, random_responsibilities, responsibilities
+from torchrl_tsallis.modes.sampler import EpisodeSampler, make_episode_buffer
+
+__all__ = [
+    "Annealing",
+    "EpisodeMixture",
+    "EpisodeSampler",
+    "episode_means",
+    "make_episode_buffer",
+    "random_responsibilities",
+    "responsibilities",
+    "robust_log_prob",
+]
