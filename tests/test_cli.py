@@ -109,3 +109,57 @@ def test_ctrl_c_is_exit_code_130(file, capsys, tmp_path, monkeypatch):
     monkeypatch.setattr("torchrl_tsallis.run.rate", interrupted)
     code, _, err = call(capsys, "rate", file, "--out", tmp_path / "a")
     assert code == 130 and err == "tsallis: stopped; nothing was written\n"
+
+
+@pytest.mark.parametrize("kind", ["tensorboard", "wandb"])
+def test_a_rating_is_logged_where_that_is_asked_for(kind, file, capsys, tmp_path, monkeypatch):
+    pytest.importorskip(kind)
+    for name, value in (("WANDB_MODE", "offline"), ("WANDB_SILENT", "true")):
+        monkeypatch.setenv(name, value)
+    out = tmp_path / "door"
+    code, answer, err = call(capsys, "rate", file, "--out", out, "--train.steps", "20", "--json", "--log", kind)
+    assert not code and json.loads(answer)["logs"] == str(tmp_path / "logs"), err
+    assert out.is_dir() and not any(path.name == "logs" for path in out.iterdir())
+    assert _tables(tmp_path / "logs", kind) == 1
+    code, answer, err = call(capsys, "report", out, "--log", kind, "--log-dir", tmp_path / "again")
+    assert not code and f"logs: {tmp_path / 'again'}" in answer and _tables(tmp_path / "again", kind) == 1
+
+
+def _tables(logs, kind):
+    """Tables of 12 episodes in a folder of logs."""
+    if kind == "wandb":
+        return sum(len(json.loads(path.read_text())["data"]) == 12 for path in logs.rglob("*.table.json"))
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    events = EventAccumulator(str(logs / "tensorboard" / "door")).Reload()
+    assert events.Tags()["histograms"] == ["ratings/surprise"]
+    (tag,) = (tag for tag in events.Tags()["tensors"] if tag.startswith("ratings/episodes"))
+    return int(len(events.Tensors(tag)[0].tensor_proto.string_val[0].decode().split("\n")) == 2 + 12)
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("--log-dir", "logs"), "add --log tensorboard or --log wandb"),
+        (("--log", "wandb"), "pip install wandb"),
+        (("--log", "mlflow"), ""),
+    ],
+)
+def test_what_cannot_be_logged_is_refused_before_anything_is_done(
+    file, ratings, capsys, tmp_path, monkeypatch, words, said
+):
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    for command in (("rate", file, "--out", tmp_path / "new"), ("report", ratings)):
+        page = (ratings / "report.html").stat().st_mtime_ns
+        code, out, err = call(capsys, *command, *words)
+        assert code == 1 and not out and said in err
+        assert not (tmp_path / "new").exists() and (ratings / "report.html").stat().st_mtime_ns == page
+
+
+def test_a_rating_that_cannot_be_logged_is_kept_and_said(file, capsys, tmp_path):
+    pytest.importorskip("tensorboard")
+    (tmp_path / "file").write_text("")
+    words = ("--train.steps", "20", "--json", "--log", "tensorboard", "--log-dir", tmp_path / "file")
+    code, out, err = call(capsys, "rate", file, "--out", tmp_path / "new", *words)
+    assert code == 1 and json.loads(out)["logs"] is None and (tmp_path / "new" / "ratings.csv").exists()
+    assert "nothing logged" in err and str(tmp_path / "file") in err and err.count("\n") == 1

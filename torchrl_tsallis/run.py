@@ -12,8 +12,9 @@ from typing import Any
 
 import torch
 from tensordict import TensorDictBase
+from torchrl.record.loggers.common import Logger
 
-from torchrl_tsallis._checks import check_number
+from torchrl_tsallis._checks import check_number, shown
 from torchrl_tsallis.data.hygiene import inspect_demonstrations
 from torchrl_tsallis.data.signals import episode_signals
 from torchrl_tsallis.jobs.files import atomic_path
@@ -63,6 +64,7 @@ def rate(
     progress: bool = True,
     overwrite: bool = False,
     command: str = "",
+    logger: Logger | None = None,
 ) -> Run:
     r"""Rates demonstrations by policies that saw them and by policies that did not.
 
@@ -93,6 +95,9 @@ def rate(
         progress: whether to show a bar.
         overwrite: whether an earlier run in ``out`` is replaced, once this one is done.
         command: what ``run.json`` says that it was made by. Default: this function.
+        logger: any of TorchRL's, or what :func:`~torchrl_tsallis.trainers.make_logger` makes: W&B and TensorBoard get
+            the episodes as a table and the surprise of the steps as a histogram, once the folder is written. Default:
+            None.
 
     Returns:
         The run, opened from its folder.
@@ -101,6 +106,7 @@ def rate(
         FileExistsError: if ``out`` holds something.
         OSError: if something cannot be read or written.
         KeyError: if a key is missing.
+        TypeError: if ``logger`` is something else.
         ValueError: if data or a number cannot be used; the message says what to do.
 
     Examples:
@@ -114,6 +120,8 @@ def rate(
     """
     for name, value, low in (("seeds", seeds, 1), ("folds", folds, 2), ("batch_size", batch_size, 1)):
         check_number(name, value, low=low, integer=True)
+    if logger is not None and not isinstance(logger, Logger):
+        raise TypeError(f"logger must be one of TorchRL's, as make_logger makes them, got {shown(logger)}")
     check_device(device)
     _check_place(path_or_data, out, overwrite)
     source = load_source(path_or_data, obs=obs, action=action, episode=episode, format=format, filter_key=filter_key)
@@ -134,6 +142,10 @@ def rate(
         _write_policy(folder, members, len(splits), source, "ratings", numbers, command or "torchrl_tsallis.run.rate")
         write_tables(folder, source, episodes, found, by_seed, episode_signals(data))
         write_json(folder / "summary.json", summary | {"u": u, "findings": findings})
+    if logger is not None:
+        from torchrl_tsallis.report.log import log_ratings
+
+        log_ratings(out, logger)
     return Run.open(out)
 
 

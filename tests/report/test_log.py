@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import json
+
 import pytest
 from torchrl.record.loggers.csv import CSVLogger
 
 from torchrl_tsallis.report import log_ratings
+from torchrl_tsallis.runs.tables import SIGNALS
 
 
 class Wandb:
@@ -51,6 +54,45 @@ def test_wandb_gets_a_table_and_a_histogram(write_folder, monkeypatch):
     assert isinstance(table, wandb.Table) and [row[0] for row in table.data] == list(range(1, 13))
     assert {row[1] for row in table.data[:3]} == {"demo_9", "demo_10", "demo_11"}
     assert logger.logged["door/surprise"].max() > 4
+    named = ["rank", "episode", "surprise", "low", "high", "share over 3 decades", "worst step"]
+    assert table.columns == [*named, "steps", *SIGNALS]
+    first = dict(zip(table.columns, table.data[0], strict=True))
+    assert first["high"] - first["low"] == pytest.approx(0.6, abs=1e-3) and first["low"] < first["surprise"]
+
+
+def test_a_number_that_is_not_there_is_left_empty(write_folder, monkeypatch):
+    pytest.importorskip("wandb")
+    from torchrl_tsallis.trainers import log_adapters
+
+    folder, logger = write_folder(), Wandb()
+    lines = (folder / "episodes.csv").read_text().splitlines()
+    cells = lines[-1].split(",")
+    lines[-1] = ",".join([*cells[:4], "", "", *cells[6:]])  # one seed has no interval
+    (folder / "episodes.csv").write_text("\n".join(lines) + "\n")
+    monkeypatch.setitem(log_adapters.ADAPTERS, Wandb, log_adapters.WandbAdapter)
+    log_ratings(folder, logger)
+    (row,) = (row for row in logger.logged["ratings/episodes"].data if row[1] == "demo_11")
+    assert row[3:5] == [None, None] and row[2] > 4
+
+
+@pytest.mark.parametrize("kind", ["tensorboard", "wandb"])
+def test_each_logger_of_a_group_gets_both(kind, write_folder, tmp_path, monkeypatch):
+    pytest.importorskip(kind)
+    from torchrl_tsallis.trainers import make_logger
+
+    monkeypatch.setenv("WANDB_MODE", "offline")
+    monkeypatch.setenv("WANDB_SILENT", "true")
+    logger = make_logger(kind, tmp_path / "logs", "door")
+    log_ratings(write_folder(), logger)
+    logger.shutdown()
+    if kind == "wandb":
+        (file,) = (tmp_path / "logs").rglob("*.table.json")
+        assert len(json.loads(file.read_text())["data"]) == 12
+    else:
+        from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+        tags = EventAccumulator(str(tmp_path / "logs/tensorboard/door")).Reload().Tags()
+        assert tags["histograms"] == ["ratings/surprise"] and tags["tensors"]
 
 
 def test_csv_gets_nothing(write_folder, tmp_path):

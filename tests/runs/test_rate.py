@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import csv
 import json
+import subprocess
+import sys
 
 import numpy as np
 import pytest
 import torch
+from torchrl.record.loggers.csv import CSVLogger
 
 from torchrl_tsallis.data import RobustScaling
 from torchrl_tsallis.run import Run, rate, train
@@ -47,6 +50,35 @@ def test_the_tables_say_the_same_of_rows_and_of_episodes(run):
         assert float(episode["low"]) <= float(episode["surprise"]) <= float(episode["high"])
     share = np.mean([float(row["rating"]) for row in rows if row["episode"] in CORRUPTED])
     assert share < 0.5 * np.mean([float(row["rating"]) for row in rows if row["episode"] not in CORRUPTED])
+
+
+def test_a_logger_gets_the_table_of_the_episodes_and_the_histogram_of_the_steps(data, tmp_path):
+    pytest.importorskip("tensorboard")
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+    from torchrl.record.loggers.tensorboard import TensorboardLogger
+
+    logger = TensorboardLogger("door", log_dir=str(tmp_path / "logs"))
+    rate(data, tmp_path / "run", steps=10, seeds=2, progress=False, logger=logger)
+    logger.experiment.close()
+    events = EventAccumulator(str(logger.log_dir), size_guidance={"histograms": 0}).Reload()
+    assert events.Tags()["histograms"] == ["ratings/surprise"]
+    (tag,) = events.Tags()["tensors"]
+    assert len(events.Tensors(tag)[0].tensor_proto.string_val[0].decode().split("\n")) == 2 + 12
+
+
+@pytest.mark.parametrize("logger", ["wandb", CSVLogger, []])
+def test_what_is_no_logger_is_refused_before_the_training(data, tmp_path, logger):
+    with pytest.raises(TypeError, match="logger must be one of TorchRL's, as make_logger makes them, got "):
+        rate(data, tmp_path / "run", progress=False, logger=logger)
+    assert not (tmp_path / "run").exists()
+
+
+def test_rating_imports_neither_the_report_nor_a_logger():
+    code = "import sys, torchrl_tsallis.run; print([m for m in sys.modules if m.startswith(NAMES)])"
+    names = ("torchrl_tsallis.report", "torchrl_tsallis.commands", "jinja2", "matplotlib", "wandb", "tensorboard")
+    command = [sys.executable, "-c", code.replace("NAMES", repr(names))]
+    done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=300)
+    assert done.stdout.strip() == "[]"
 
 
 def test_every_row_is_rated_by_policies_that_did_not_see_it(data):

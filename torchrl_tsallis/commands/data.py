@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from torchrl_tsallis.commands.options import PolicyTraining, RateTraining, Reads, command_line, note, say
+from torchrl_tsallis.commands.options import Logs, PolicyTraining, RateTraining, Reads, command_line, note, say
 
 
 @dataclass(kw_only=True)
@@ -48,7 +48,7 @@ class Info(Reads):
 
 
 @dataclass(kw_only=True)
-class Rate(Reads):
+class Rate(Logs, Reads):
     """Rates demonstrations by policies that did not see them; leaves a folder with tables, report and policy.
 
     Args:
@@ -70,6 +70,7 @@ class Rate(Reads):
         """Rates, and writes the report where its packages are installed."""
         from torchrl_tsallis.run import rate
 
+        self.check_log()
         run = rate(
             self.path,
             self.out,
@@ -92,8 +93,20 @@ class Rate(Reads):
         except (OSError, ValueError) as error:
             note(f"no report: {error}; the ratings are in {str(self.out)!r}")
             failed = 1
+        logs: Path | None = None
+        try:
+            logs = self.send(self.out)
+        except (ImportError, OSError, RuntimeError, ValueError) as error:  # RuntimeError: of wandb
+            note(f"nothing logged: {error}; the ratings are in {str(self.out)!r}, tsallis report sends them again")
+            failed = 1
         answer = {"out": str(self.out), "report": None if page is None else str(page), **summary}
-        say(answer, f"{summary['sentence']}\n{self.out if page is None else page}", self.json)
+        answer |= {} if self.log is None else {"logs": None if logs is None else str(logs)}
+        lines = [
+            summary["sentence"],
+            str(self.out if page is None else page),
+            *([] if logs is None else [f"logs: {logs}"]),
+        ]
+        say(answer, "\n".join(lines), self.json)
         agree = max((summary["agreement"].get(name) or -1.0 for name in ("spearman", "reliability")), default=-1.0)
         low = self.fail_below is not None and (not summary["usable"] or agree < self.fail_below)
         return failed or 2 * low

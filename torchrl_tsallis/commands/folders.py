@@ -9,12 +9,12 @@ from typing import Annotated, Literal
 
 import tyro
 
-from torchrl_tsallis.commands.options import say
+from torchrl_tsallis.commands.options import Logs, say
 
 
 @dataclass(kw_only=True)
-class Report:
-    """Writes the page of a rating again, from what its folder holds.
+class Report(Logs):
+    """Writes the page of a rating again, from what its folder holds, and logs it where that is asked for.
 
     Args:
         folder: that tsallis rate left.
@@ -28,8 +28,11 @@ class Report:
         """Writes it."""
         from torchrl_tsallis.report.page import write_report
 
+        self.check_log()
         page = write_report(self.folder)
-        say({"report": str(page)}, str(page), self.json)
+        logs = self.send(self.folder)
+        text = str(page) if logs is None else f"{page}\nlogs: {logs}"
+        say({"report": str(page)} | ({} if logs is None else {"logs": str(logs)}), text, self.json)
         return 0
 
 

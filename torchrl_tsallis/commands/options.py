@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import importlib.util
 import json
 import shlex
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import tyro
 
@@ -55,6 +56,53 @@ class Reads:
         action = self.action[0] if len(self.action) == 1 else self.action or None
         common = {"episode": self.episode, "format": self.format, "filter_key": self.filter_key}
         return {"obs": self.obs or None, "action": action, **common}
+
+
+@dataclass(kw_only=True)
+class Logs:
+    """Loggers of TorchRL that get the ratings too.
+
+    Args:
+        log: tensorboard or wandb, which get the episodes as a table and the surprise of the steps as a histogram. W&B
+            needs no account: it writes a folder that wandb sync uploads later.
+        log_dir: folder of the logs. Default: logs, beside the folder of the ratings.
+    """
+
+    log: Literal["tensorboard", "wandb"] | None = None
+    log_dir: Path | None = None
+
+    def check_log(self) -> None:
+        """Refuses what cannot be logged, before anything is done.
+
+        Raises:
+            ImportError: if the logger's package is not installed.
+            ValueError: if there is a folder, and nothing to write to it.
+        """
+        if self.log is None and self.log_dir is not None:
+            raise ValueError(
+                "--log-dir is the folder of --log, which is not given: add --log tensorboard or --log wandb"
+            )
+        if self.log is not None and importlib.util.find_spec(self.log) is None:
+            raise ImportError(f"--log {self.log} needs {self.log}: pip install {self.log}")
+
+    def send(self, folder: Path) -> Path | None:
+        """Logs the ratings in a folder; returns where that was written, None without ``--log``."""
+        if self.log is None:
+            return None
+        from torchrl_tsallis.report import log_ratings
+        from torchrl_tsallis.runs import Run
+        from torchrl_tsallis.trainers import make_logger
+
+        place = folder.expanduser().resolve()
+        logs = place.parent / "logs" if self.log_dir is None else self.log_dir.expanduser()
+        run = Run.open(folder)
+        logger = make_logger(self.log, logs, place.name, tags=["ratings"])
+        try:
+            logger.log_hparams({name: run.settings[name] for name in ("data", "method", "train", "command")})
+            log_ratings(folder, logger)
+        finally:
+            logger.shutdown()
+        return logs
 
 
 @dataclass

@@ -134,6 +134,10 @@ def select_inputs(
     if mask is not None:
         # Padding may hold NaN, which would reach the weights' gradients through 0 * NaN in the network.
         inputs = inputs.apply(lambda x: x.where(expand_right(mask, x.shape), torch.zeros_like(x)))
+    if not is_tensor_collection(action) and action.is_complex():
+        raise TypeError(
+            f"{in_keys[0]!r} is {action.dtype}, needed are real numbers: convert the data, for instance by .real"
+        )
     if not is_tensor_collection(action) and action.is_floating_point() and action.dtype != (dtype or action.dtype):
         raise TypeError(
             f"{in_keys[0]!r} is {action.dtype}, the actor's parameters are {dtype}: "

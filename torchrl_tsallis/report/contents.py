@@ -79,13 +79,13 @@ def order(mean: np.ndarray) -> np.ndarray:
     return np.argsort(-np.nan_to_num(mean, nan=-np.inf), kind="stable")
 
 
-def queue(rated: RatingsFolder) -> list[dict[str, Any]]:
-    """The rows of the table of the worst episodes; each cell a pair of text and number."""
+def queue(rated: RatingsFolder, most: int = LISTED) -> list[dict[str, Any]]:
+    """The rows of the table of the worst episodes, so many at most; each cell a pair of text and number."""
     mean, low, high = (column(rated, key) for key in ("surprise", "low", "high"))
     marked, by_episode = stand_out(mean, low), parts(rated, "surprise")
     signals = [column(rated, signal.key) for signal in shown(rated)]
     rows = []
-    for rank, k in enumerate(order(mean)[:LISTED].tolist(), 1):
+    for rank, k in enumerate(order(mean)[:most].tolist(), 1):
         steps = by_episode[k]
         worst = int(np.argmax(np.nan_to_num(steps, nan=-1.0)))
         long, over = stretch(steps), float(np.mean(steps >= MARKED))

@@ -39,7 +39,8 @@ class TensorboardAdapter(LogAdapter):
 
     def table(self, name: str, columns: list[str], rows: list[list[Any]]) -> None:
         """Logs rows as a table of Markdown."""
-        cells = [[" ".join(str(value).split()).replace("|", "\\|") for value in row] for row in (columns, *rows)]
+        texts = [["" if value is None else str(value) for value in row] for row in (columns, *rows)]
+        cells = [[" ".join(text.split()).replace("|", "\\|") for text in row] for row in texts]
         lines = [cells[0], ["---"] * len(columns), *cells[1:]]
         self.logger.experiment.add_text(name, "\n".join("|" + "|".join(line) + "|" for line in lines))
 

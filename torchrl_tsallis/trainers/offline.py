@@ -30,6 +30,12 @@ from torchrl_tsallis.trainers.start import OfflineClock, RunStart
 from torchrl_tsallis.trainers.stepper import GuardedStepper
 
 
+def _check_buffer(replay_buffer: Any) -> None:
+    """Raises TypeError for what gives no samples; a buffer of a user's own class may."""
+    if not (callable(getattr(replay_buffer, "sample", None)) and hasattr(replay_buffer, "sampler")):
+        raise TypeError(f"replay_buffer must be a buffer such as make_replay_buffer(data), got {shown(replay_buffer)}")
+
+
 class SampleHook(TrainerHookBase):
     """Feeds the trainer from a replay buffer, and keeps the sampler and its random numbers in checkpoints.
 
@@ -38,7 +44,7 @@ class SampleHook(TrainerHookBase):
     """
 
     def __init__(self, replay_buffer: ReplayBuffer) -> None:
-        check_instance("replay_buffer", replay_buffer, ReplayBuffer, "a buffer such as make_replay_buffer(data)")
+        _check_buffer(replay_buffer)
         self.replay_buffer = replay_buffer
         self._single = False
 
@@ -138,7 +144,7 @@ def make_offline_trainer(
         4
     """
     check_instance("loss", loss, torch.nn.Module, "a loss such as TsallisBCLoss(actor)")
-    check_instance("replay_buffer", replay_buffer, ReplayBuffer, "a buffer such as make_replay_buffer(data)")
+    _check_buffer(replay_buffer)
     check_instance("optimizer", optimizer, torch.optim.Optimizer, "an optimizer such as AdaTerm(loss.parameters())")
     for name, part, method in (
         ("updater", updater, "step"),
