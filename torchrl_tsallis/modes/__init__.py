@@ -1,5 +1,6 @@
 """Modes of behaviour in demonstrations, found without labels: mixtures of policies over whole episodes."""
 
+from torchrl_tsallis.modes.consensus import adjusted_rand_index, consensus, together
 from torchrl_tsallis.modes.likelihood import episode_means, robust_log_prob
 from torchrl_tsallis.modes.mixture import EpisodeMixture
 from torchrl_tsallis.modes.responsibilities import Annealing, random_responsibilities, responsibilities
@@ -9,9 +10,12 @@ __all__ = [
     "Annealing",
     "EpisodeMixture",
     "EpisodeSampler",
+    "adjusted_rand_index",
+    "consensus",
     "episode_means",
     "make_episode_buffer",
     "random_responsibilities",
     "responsibilities",
     "robust_log_prob",
+    "together",
 ]

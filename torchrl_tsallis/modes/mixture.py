@@ -176,8 +176,8 @@ class EpisodeMixture(TrainerHookBase):
         given = state_dict["responsibilities"]
         if given.shape != self.responsibilities.shape:
             raise ValueError(
-                f"the checkpoint has responsibilities {list(given.shape)}, the mixture {list(self.responsibilities.shape)}"
-                ": resume with the same components and episodes"
+                f"the checkpoint has {list(given.shape)} components and episodes, the mixture "
+                f"{list(self.responsibilities.shape)}: resume with the same components and episodes"
             )
         self.responsibilities = given.clone()
         self.updates, self.steps = int(state_dict["updates"]), int(state_dict["steps"])

@@ -57,6 +57,7 @@ class Annealing:
     last: float = 20.0
 
     def __post_init__(self) -> None:
+        """Checks the numbers."""
         check_number("start", self.start, low=0, integer=True)
         check_number("length", self.length, low=1, integer=True)
         check_number("first", self.first, above=0)
