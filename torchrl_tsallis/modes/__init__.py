@@ -1,6 +1,8 @@
 """Modes of behaviour in demonstrations, found without labels: mixtures of policies over whole episodes."""
 
 from torchrl_tsallis.modes.consensus import adjusted_rand_index, consensus, together
+from torchrl_tsallis.modes.find import find_modes, train_mixtures
+from torchrl_tsallis.modes.found import Modes
 from torchrl_tsallis.modes.likelihood import episode_means, robust_log_prob
 from torchrl_tsallis.modes.mixture import EpisodeMixture
 from torchrl_tsallis.modes.responsibilities import Annealing, random_responsibilities, responsibilities
@@ -9,13 +11,16 @@ from torchrl_tsallis.modes.sampler import EpisodeSampler, make_episode_buffer
 __all__ = [
     "Annealing",
     "EpisodeMixture",
+    "Modes",
     "EpisodeSampler",
     "adjusted_rand_index",
     "consensus",
     "episode_means",
+    "find_modes",
     "make_episode_buffer",
     "random_responsibilities",
     "responsibilities",
     "robust_log_prob",
     "together",
+    "train_mixtures",
 ]
