@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -34,7 +35,7 @@ UPDATES, HELD_OUT_SHARE = 60, 2 / 3
 #: Signed-rank statistic over the held-out episodes above which one mode is not enough.
 SURE = 2.0
 #: Fewest steps between two updates.
-LEAST_STEPS = 10
+LEAST_STEPS = 20
 
 
 def find_modes(
@@ -53,8 +54,9 @@ def find_modes(
 ) -> Modes:
     """Finds modes of behaviour, whose units are whole episodes, without labels.
 
-    1. Mixtures and single policies learn from all folds of the episodes but one. Unless the mixtures explain
-       the held-out episodes better (:func:`~torchrl_tsallis.modes.found.signed_rank` over 2), there is one mode.
+    1. Mixtures, and as many policies without modes as they have components, learn from all folds of the episodes but
+       one. Unless the mixtures explain the held-out episodes better (:func:`~torchrl_tsallis.modes.found.signed_rank`
+       over 2), there is one mode.
     2. Else mixtures are started anew on everything, and modes are groups of episodes that are of one component in
        most starts (:func:`~torchrl_tsallis.modes.consensus`). Components that share a behaviour, and share its
        episodes in one way here and in another there, become one mode by that.
@@ -102,15 +104,14 @@ def find_modes(
     scaled = RobustScaling.fit(rows)(rows).set("episode", episodes.of_rows())
     first = episodes.starts
     known = torch.stack([~mask[first] for mask in fold_episodes(scaled, folds, seed=seed)])
-    sizes = [1] * folds + [components] * folds
+    sizes = [1] * (components * folds) + [components] * folds
     shared: dict[str, Any] = {"batch_size": batch_size, "device": device, "progress": progress}
     short = max(1, round(HELD_OUT_SHARE * updates))
-    mixture = train_mixtures(scaled, sizes, seed=seed, known=known.repeat(2, 1), updates=short, **shared)
-    score = _held_out(mixture, episodes.lengths)
-    one, several = (
-        torch.stack([score[part + fold] for fold in range(folds)])[known.logical_not().int().argmax(0), range(count)]
-        for part in (0, folds)
-    )
+    seen = torch.cat([known.repeat(components, 1), known])
+    mixture = train_mixtures(scaled, sizes, seed=seed, known=seen, updates=short, **shared)
+    score = _held_out(mixture, episodes.lengths, folds)
+    held = known.logical_not().int().argmax(0)
+    one, several = (part[held, torch.arange(count)] for part in score)
     if signed_rank(several - one) <= SURE and not always:
         everything = tuple(range(count))
         pairs = torch.ones(count, count, dtype=torch.float64)
@@ -171,11 +172,16 @@ def train_mixtures(
     return mixture
 
 
-def _held_out(mixture: EpisodeMixture, lengths: Tensor) -> Tensor:
-    r"""Log-likelihood a step of every episode under each mixture, ``[G, E]``.
+def _held_out(mixture: EpisodeMixture, lengths: Tensor, folds: int) -> tuple[Tensor, Tensor]:
+    r"""Log-likelihood a step of every episode, ``[F, E]``: under policies that have the same data, and under mixtures.
 
     .. math:: \frac{1}{T_e} \ln \sum_c \pi_c \, e^{T_e \bar\ell_{ec}}
+
+    There are as many policies of the same data as components, with equal shares: the best of several explains an
+    episode better than one does, whether there are modes or not.
     """
-    given, share = mixture.log_likelihood(), mixture.share.clamp_min(1e-12).log()
-    total = given * lengths + share[:, None]
-    return torch.stack([part.logsumexp(0) for part in total.split(mixture.sizes)]) / lengths
+    given, share = mixture.log_likelihood() * lengths, mixture.share.clamp_min(1e-12).log()
+    alone = sum(size == 1 for size in mixture.sizes)
+    same = given[:alone].unflatten(0, (-1, folds))
+    several = [part.logsumexp(0) for part in (given[alone:] + share[alone:, None]).split(mixture.sizes[alone:])]
+    return (same.logsumexp(0) - math.log(len(same))) / lengths, torch.stack(several) / lengths

@@ -18,7 +18,7 @@ class Modes:
         groups: episodes of each mode; the largest mode first. An episode that no mode shares is a group of its own.
         pairs: how often two episodes were of one component, over the starts, ``[E, E]``.
         starts: component of each episode in each start, ``[K, E]``.
-        one: log-likelihood a step of each held-out episode under one policy, ``[E]``.
+        one: log-likelihood a step of each held-out episode under policies that all have the same data, ``[E]``.
         several: the same under a mixture, ``[E]``.
     """
 
