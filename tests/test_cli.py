@@ -163,3 +163,19 @@ def test_a_rating_that_cannot_be_logged_is_kept_and_said(file, capsys, tmp_path)
     code, out, err = call(capsys, "rate", file, "--out", tmp_path / "new", *words)
     assert code == 1 and json.loads(out)["logs"] is None and (tmp_path / "new" / "ratings.csv").exists()
     assert "nothing logged" in err and str(tmp_path / "file") in err and err.count("\n") == 1
+
+
+def test_modes_become_a_copy_and_a_policy(file, capsys, tmp_path):
+    words = ["--components", "2", "--train.updates", "3", "--train.batch-size", "32", "--json"]
+    code, out, err = call(capsys, "modes", file, "--out", tmp_path / "modes", *words)
+    answer = json.loads(out)
+    assert not code and not err and sum(mode["episodes"] for mode in answer["modes"]) == 12
+    best = answer["recommended"]
+    code, out, _ = call(capsys, "curate", tmp_path / "modes", "--mode", best, "--out", tmp_path / "copy.npz", "--json")
+    assert not code and len(json.loads(out)["kept"]) == answer["modes"][best]["episodes"]
+    code, out, _ = call(capsys, "info", tmp_path / "copy.npz")
+    assert not code and "NaN" not in out
+    options = ["--mode", best, "--out", tmp_path / "policy", "--train.steps", "10", "--json"]
+    assert not call(capsys, "train", tmp_path / "modes", *options)[0]
+    code, _, err = call(capsys, "train", tmp_path / "modes", "--mode", "77", "--out", tmp_path / "other")
+    assert code == 1 and "mode=77 is none of those" in err and not (tmp_path / "other").exists()

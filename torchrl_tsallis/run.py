@@ -23,12 +23,13 @@ from torchrl_tsallis.runs.folder import check_free, new_folder, write_json
 from torchrl_tsallis.runs.held_out import hold_out
 from torchrl_tsallis.runs.judgement import judge
 from torchrl_tsallis.runs.members import LR, Members, Split, check_device, make_splits, train_members
+from torchrl_tsallis.runs.modes import mode_source, modes
 from torchrl_tsallis.runs.opened import Run
 from torchrl_tsallis.runs.saved import save_run
 from torchrl_tsallis.runs.source import Source, load_source
 from torchrl_tsallis.runs.tables import write_tables
 
-__all__ = ["Run", "default_steps", "rate", "train"]
+__all__ = ["Run", "default_steps", "modes", "rate", "train"]
 
 #: Passes over the data, and bounds of the steps that they give.
 EPOCHS, LEAST_STEPS, MOST_STEPS = 40, 1000, 10_000
@@ -158,6 +159,7 @@ def train(
     episode: str | None = None,
     format: str | None = None,
     filter_key: str | None = None,
+    mode: int | None = None,
     steps: int | None = None,
     seed: int = 0,
     batch_size: int = 256,
@@ -178,6 +180,7 @@ def train(
         episode: key of the episode's number (npz, CSV).
         format: name of the format.
         filter_key: subset of the file's episodes.
+        mode: of the folder ``path_or_data`` that :func:`modes` left, whose episodes alone are imitated.
         steps: gradient steps. Default: :func:`default_steps`.
         seed: of the first parameters and of the samples' order.
         batch_size: samples a step.
@@ -196,7 +199,14 @@ def train(
     check_number("seed", seed, low=0, integer=True)
     check_device(device)
     _check_place(path_or_data, out, overwrite)
-    source = load_source(path_or_data, obs=obs, action=action, episode=episode, format=format, filter_key=filter_key)
+    chosen = {"obs": obs, "action": action, "episode": episode, "format": format, "filter_key": filter_key}
+    if mode is None:
+        source = load_source(path_or_data, **chosen)  # type: ignore[arg-type]
+    else:
+        given = [name for name, value in chosen.items() if value is not None]
+        if given or isinstance(path_or_data, TensorDictBase):
+            raise ValueError("mode is one of a folder of modes, which says what to read: give that folder, and no keys")
+        source = mode_source(path_or_data, mode)
     steps = _steps(steps, len(source.data), batch_size)
     split = Split(seed, torch.zeros(len(source.data), dtype=torch.bool))
     with new_folder(out, overwrite=overwrite) as folder:

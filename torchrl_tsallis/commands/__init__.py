@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from torchrl_tsallis.commands.data import Info, Rate, Train
+from torchrl_tsallis.commands.data import Info, Modes, Rate, Train
 from torchrl_tsallis.commands.folders import Curate, Export, Report
 
 __all__ = ["COMMANDS"]
@@ -18,6 +18,7 @@ COMMANDS: dict[str, Any] = {
     "info": Info,
     "rate": Rate,
     "report": Report,
+    "modes": Modes,
     "curate": Curate,
     "train": Train,
     "export": Export,

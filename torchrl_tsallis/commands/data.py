@@ -1,12 +1,22 @@
-"""Commands that read demonstrations: info, rate, train."""
+"""Commands that read demonstrations: info, rate, modes, train."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Literal
 
-from torchrl_tsallis.commands.options import Logs, PolicyTraining, RateTraining, Reads, command_line, note, say
+from torchrl_tsallis.commands.options import (
+    Logs,
+    ModesTraining,
+    PolicyTraining,
+    RateTraining,
+    Reads,
+    command_line,
+    note,
+    say,
+)
 
 
 @dataclass(kw_only=True)
@@ -113,17 +123,61 @@ class Rate(Logs, Reads):
 
 
 @dataclass(kw_only=True)
-class Train(Reads):
-    """Trains a policy on all of the demonstrations, of which those that are noise count less.
+class Modes(Reads):
+    """Finds whose demonstrations these are: modes of behaviour among whole episodes, without labels.
 
     Args:
         out: folder to write.
+        components: auto, or a number: then modes are looked for although one may be enough.
+        train: of the mixtures.
+        device: of the policies, such as cuda.
+        overwrite: whether an earlier run in the folder is replaced.
+    """
+
+    out: Path = Path("modes")
+    components: Literal["auto"] | int = "auto"
+    train: ModesTraining = field(default_factory=ModesTraining)
+    device: str = "cpu"
+    overwrite: bool = False
+
+    def __call__(self, words: Sequence[str]) -> int:
+        """Finds them."""
+        from torchrl_tsallis.run import modes
+
+        found = modes(
+            self.path,
+            self.out,
+            **self.chosen(),
+            **vars(self.train),
+            components=None if self.components == "auto" else self.components,
+            device=self.device,
+            overwrite=self.overwrite,
+            progress=not self.json,
+            command=command_line(words),
+        )
+        lines = [found.summary["sentence"], str(self.out / "modes.csv")]
+        if len(found.summary["modes"]) > 1:
+            best = found.summary["recommended"]
+            lines.append(f"tsallis curate {self.out} --mode {best} --out COPY    # that mode alone, in the same format")
+            lines.append(f"tsallis train {self.out} --mode {best} --out POLICY   # a policy of it")
+        say({"out": str(self.out), **found.summary}, "\n".join(lines), self.json)
+        return 0
+
+
+@dataclass(kw_only=True)
+class Train(Reads):
+    """Trains a policy on all of the demonstrations, of which those that are noise count less; or on one mode of them.
+
+    Args:
+        out: folder to write.
+        mode: number of a mode; the path is then the folder that tsallis modes left.
         train: of the policy.
         device: of the policy, such as cuda.
         overwrite: whether an earlier run in the folder is replaced.
     """
 
     out: Path
+    mode: int | None = None
     train: PolicyTraining = field(default_factory=PolicyTraining)
     device: str = "cpu"
     overwrite: bool = False
@@ -137,6 +191,7 @@ class Train(Reads):
             self.out,
             **self.chosen(),
             **vars(self.train),
+            mode=self.mode,
             device=self.device,
             overwrite=self.overwrite,
             progress=not self.json,

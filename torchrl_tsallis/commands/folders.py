@@ -41,12 +41,13 @@ class Curate:
     """Copies demonstrations without the most surprising ones, in their format; look at them before.
 
     Args:
-        folder: that tsallis rate left.
+        folder: that tsallis rate left; with --mode, that tsallis modes left.
         out: file or folder to write.
         drop: whole episodes, or single steps (npz, CSV and TED).
         share: part of the episodes (steps) to drop: the most surprising ones.
         below: surprise in decades below which an episode (step) stays.
         keep_list: JSON file with the names of the episodes that stay.
+        mode: number of the mode whose episodes stay.
         name: of the filter key (robomimic).
         remove: whether robomimic's episodes are removed rather than left out of the filter key.
         force: whether to use a rating that says that it is not usable.
@@ -61,6 +62,7 @@ class Curate:
     share: float | None = None
     below: float | None = None
     keep_list: Annotated[Path | None, tyro.conf.arg(name="list")] = None
+    mode: int | None = None
     name: str = "curated"
     remove: bool = False
     force: bool = False

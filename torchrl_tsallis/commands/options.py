@@ -135,3 +135,22 @@ class PolicyTraining:
     steps: int | None = None
     seed: int = 0
     batch_size: int = 256
+
+
+@dataclass
+class ModesTraining:
+    """How the mixtures are trained.
+
+    Args:
+        starts: of the mixture on everything, on which modes have to agree.
+        folds: of the episodes, for the test whether one mode is enough.
+        updates: of the responsibilities, an epoch between two.
+        batch_size: samples a step and component.
+        seed: of folds, starts and policies.
+    """
+
+    starts: int = 3
+    folds: int = 3
+    updates: int = 60
+    batch_size: int = 256
+    seed: int = 0

@@ -13,6 +13,7 @@ from typing import Any, Literal
 from torchrl_tsallis.data.curators import CURATORS, Plan
 from torchrl_tsallis.data.curators.choice import decide
 from torchrl_tsallis.data.curators.place import RECORD, check_place, leftovers, record_of, staged
+from torchrl_tsallis.data.modes_folder import ModesFolder
 from torchrl_tsallis.data.ratings_folder import RatingsFolder
 from torchrl_tsallis.data.readers import Options, Reader, open_reader
 from torchrl_tsallis.jobs.files import atomic_path
@@ -63,6 +64,7 @@ def curate(
     share: float | None = None,
     below: float | None = None,
     keep_list: str | os.PathLike[str] | Iterable[str | int] | None = None,
+    mode: int | None = None,
     name: str = "curated",
     remove: bool = False,
     force: bool = False,
@@ -71,16 +73,17 @@ def curate(
 ) -> Curated:
     """Copies demonstrations without some episodes or steps, in the format that came in; the source stays as it is.
 
-    Exactly one of ``share``, ``below`` and ``keep_list`` decides. A surprising demonstration need not be a bad one:
-    look at those that go before they are gone, by ``dry_run`` and the report.
+    Exactly one of ``share``, ``below``, ``keep_list`` and ``mode`` decides. A surprising demonstration need not be a
+    bad one: look at those that go before they are gone, by ``dry_run`` and the report.
 
     Args:
-        folder: of a rating.
+        folder: of a rating; with ``mode``, of a search for modes.
         out: file or folder to write; a file's name ends as that of the source.
         drop: whole episodes, or single steps (npz, CSV and TED alone: elsewhere rows belong to sequences).
         share: part of the episodes (steps) to drop, in (0, 1): the most surprising ones, rounded down.
         below: surprise in decades below which an episode (step) stays.
         keep_list: names or numbers of the episodes that stay, or a JSON file with a list of them.
+        mode: whose episodes stay.
         name: of the filter key (robomimic alone).
         remove: whether robomimic's episodes are removed, rather than left out of the filter key.
         force: whether to use a rating that says that it is not usable.
@@ -97,8 +100,12 @@ def curate(
         TypeError: if an argument is of a wrong kind.
         ValueError: if the rating is not usable, the data are not those that were rated, or nothing or all would go.
     """
-    rated = RatingsFolder.open(folder)
-    _check(drop, share, below, keep_list, name)
+    _check(drop, share, below, keep_list, mode, name)
+    if mode is None:
+        rated = RatingsFolder.open(folder)
+    else:
+        found = ModesFolder.open(folder)
+        rated, keep_list = found.as_ratings(), found.episodes_of(mode)
     if not rated.usable and keep_list is None and not force:
         why = "; ".join(rated.reasons) or "summary.json gives no reason"
         raise ValueError(
@@ -110,6 +117,9 @@ def curate(
     if curator_class is None:
         raise ValueError(f"{reader.name} data cannot be copied, only {', '.join(CURATORS)}")
     keep, rows, why_dropped, rule = decide(rated, drop, share, below, keep_list)
+    if mode is not None:
+        rule = f"episodes of other modes than {mode}"
+        why_dropped = {name: f"mode {found.mode[k]}" for k, name in enumerate(found.names) if name in why_dropped}
     source, target = Path(reader.path), Path(out).expanduser()
     plan = Plan(
         source,
@@ -169,22 +179,21 @@ def _summary(
     )
 
 
-def _check(drop: Any, share: Any, below: Any, keep_list: Any, name: Any) -> None:
+def _check(drop: Any, share: Any, below: Any, keep_list: Any, mode: Any, name: Any) -> None:
     if drop not in ("episodes", "samples"):
         raise ValueError(f"drop={drop!r}: choose 'episodes' or 'samples'")
-    given = {
-        key: value for key, value in (("share", share), ("below", below), ("keep_list", keep_list)) if value is not None
-    }
+    rules = {"share": share, "below": below, "keep_list": keep_list, "mode": mode}
+    given = {key: value for key, value in rules.items() if value is not None}
     if len(given) != 1:
-        raise ValueError(f"give exactly one of share, below and keep_list, got {', '.join(given) or 'none'}")
+        raise ValueError(f"give exactly one of share, below, keep_list and mode, got {', '.join(given) or 'none'}")
     for key in ("share", "below"):
         value = given.get(key, 0.5)
         if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
             raise TypeError(f"{key}={value!r} must be a finite number")
     if share is not None and not 0 < share < 1:
         raise ValueError(f"share={share} must lie between 0 and 1: it is the part of the {drop} that goes")
-    if keep_list is not None and drop == "samples":
-        raise ValueError("keep_list names episodes, drop='samples' drops steps: use share or below")
+    if (keep_list is not None or mode is not None) and drop == "samples":
+        raise ValueError(f"{next(iter(given))} names episodes, drop='samples' drops steps: use share or below")
     if not isinstance(name, str) or not name or "/" in name:
         raise ValueError(f"name={name!r} must be a text without '/'")
 

@@ -71,7 +71,7 @@ class RatingsFolder:
             raise FileNotFoundError(
                 f"there is no folder {str(path)!r}: rate the data first, and give the rating's folder"
             )
-        run, summary = (_read_json(path / name) for name in ("run.json", "summary.json"))
+        run, summary = (read_text(path / name) for name in ("run.json", "summary.json"))
         if run.get("kind", "ratings") != "ratings":
             raise ValueError(f"{str(path)!r} is a run of kind {run['kind']!r}, needed is one that rated data: rate it")
         if run.get("format", 1) != 1:
@@ -79,9 +79,9 @@ class RatingsFolder:
         if not isinstance(run.get("data"), dict):
             raise ValueError(f"{str(path / 'run.json')!r} does not say which data were rated: rate them again")
         file = path / "episodes.csv"
-        cells = _read_csv(file, _EPISODES)
+        cells = read_table(file, _EPISODES)
         names = tuple(cells.pop("source"))
-        episodes = {key: _numbers(file, key, column) for key, column in cells.items()}
+        episodes = {key: numbers_of(file, key, column) for key, column in cells.items()}
         lengths = episodes["steps"]
         if not len(names):
             raise ValueError(f"{str(file)!r} names no episode: rate the data again")
@@ -90,7 +90,7 @@ class RatingsFolder:
                 f"{str(file)!r} must name each episode once, with its number of steps: rate the data again"
             )
         file = path / "ratings.csv"
-        steps = {key: _numbers(file, key, column) for key, column in _read_csv(file, _STEPS).items()}
+        steps = {key: numbers_of(file, key, column) for key, column in read_table(file, _STEPS).items()}
         order = np.argsort(steps["row"], kind="stable")
         steps = {key: column[order] for key, column in steps.items()}
         out = cls(path, run, summary, names, lengths.astype(np.int64), episodes, steps)
@@ -108,7 +108,8 @@ class RatingsFolder:
         return out
 
 
-def _read_json(file: Path) -> dict[str, Any]:
+def read_text(file: Path) -> dict[str, Any]:
+    """An object of JSON; what is wrong with it is said with the file's name."""
     try:
         found = json.loads(file.read_text(encoding="utf-8"))
     except FileNotFoundError as error:
@@ -122,7 +123,8 @@ def _read_json(file: Path) -> dict[str, Any]:
     return found
 
 
-def _read_csv(file: Path, needed: tuple[str, ...]) -> dict[str, list[str]]:
+def read_table(file: Path, needed: tuple[str, ...]) -> dict[str, list[str]]:
+    """Columns of a CSV file that has at least the needed ones."""
     try:
         with file.open(newline="", encoding="utf-8") as handle:
             rows = list(csv.reader(handle))
@@ -144,7 +146,8 @@ def _read_csv(file: Path, needed: tuple[str, ...]) -> dict[str, list[str]]:
     return {key: [row[k] for row in rows[1:]] for k, key in enumerate(header)}
 
 
-def _numbers(file: Path, key: str, cells: list[str]) -> np.ndarray:
+def numbers_of(file: Path, key: str, cells: list[str]) -> np.ndarray:
+    """A column as numbers, ``[N]``; NaN where a cell is empty."""
     out = np.full(len(cells), np.nan)
     for k, cell in enumerate(cells):
         try:

@@ -20,7 +20,7 @@ from torchrl_tsallis.jobs.files import atomic_path, disk_errors
 RUN, FORMAT = "run.json", 1
 #: What a run, its report and its card consist of; pictures and logs are recognised by their endings.
 FILES = (RUN, "policy.safetensors", "rating.safetensors", "target.safetensors", "scaling.json")
-TABLES = ("ratings.csv", "episodes.csv", "summary.json")
+TABLES = ("ratings.csv", "episodes.csv", "modes.csv", "summary.json")
 _OTHERS, _ENDINGS = ("report.html", "README.md"), (".png", ".svg")
 
 

@@ -1,0 +1,191 @@
+"""From a file of demonstrations to its modes: :func:`modes`, and the demonstrations of one of them."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+
+from torchrl_tsallis._checks import check_number
+from torchrl_tsallis.data.modes_folder import KIND, ModesFolder
+from torchrl_tsallis.data.rows import take_rows
+from torchrl_tsallis.modes.find import BETA, LR, SURE, UPDATES, find_modes
+from torchrl_tsallis.modes.found import Modes, signed_rank
+from torchrl_tsallis.runs.folder import FORMAT, RUN, check_free, new_folder, write_csv, write_json
+from torchrl_tsallis.runs.members import check_device
+from torchrl_tsallis.runs.saved import versions
+from torchrl_tsallis.runs.source import Source, identity, load_source
+
+#: Certainty of a mode, and how much larger than the next one it has to be, for a recommendation that is sure.
+CERTAIN, LARGER = 0.8, 1.25
+MODES = ("episode", "source", "steps", "mode", "membership", "gain")
+
+
+def modes(
+    path_or_data: str | os.PathLike[str] | TensorDictBase,
+    out: str | os.PathLike[str],
+    *,
+    obs: str | Sequence[str] | None = None,
+    action: str | Sequence[str] | None = None,
+    episode: str | None = None,
+    format: str | None = None,
+    filter_key: str | None = None,
+    components: int | None = None,
+    starts: int = 3,
+    folds: int = 3,
+    updates: int = UPDATES,
+    batch_size: int = 256,
+    seed: int = 0,
+    device: str = "cpu",
+    progress: bool = True,
+    overwrite: bool = False,
+    command: str = "",
+) -> ModesFolder:
+    """Finds modes of behaviour among demonstrations; see :func:`~torchrl_tsallis.modes.find_modes`.
+
+    Args:
+        path_or_data: as for :func:`~torchrl_tsallis.run.rate`, and so are the next five.
+        out: folder to write, whole or not at all.
+        obs: keys of the observation in the file.
+        action: key of the action in the file.
+        episode: key of the episode's number (npz, CSV).
+        format: name of the format.
+        filter_key: subset of the file's episodes.
+        components: of each mixture. Default: 6, and one mode where that is enough.
+        starts: of the mixture on everything.
+        folds: of the episodes.
+        updates: of the responsibilities, an epoch between two.
+        batch_size: samples a step and component.
+        seed: of folds, starts and policies.
+        device: of the policies.
+        progress: whether to show bars.
+        overwrite: whether an earlier run in ``out`` is replaced, once this one is done.
+        command: what ``run.json`` says that it was made by.
+
+    Returns:
+        The folder, opened.
+
+    Raises:
+        FileExistsError: if ``out`` holds something.
+        ValueError: if data or a number cannot be used; the message says what to do.
+
+    Examples:
+        >>> import tempfile
+        >>> from tensordict import TensorDict
+        >>> rows = {"observation": torch.rand(80, 2), "action": torch.rand(80, 1), "episode": torch.arange(80) // 10}
+        >>> folder = os.path.join(tempfile.mkdtemp(), "modes")
+        >>> found = modes(TensorDict(rows, [80]), folder, updates=2, progress=False)
+        >>> len(found.names), sum(mode["episodes"] for mode in found.summary["modes"])
+        (8, 8)
+    """
+    check_device(device)
+    check_free(out, overwrite, path_or_data if isinstance(path_or_data, (str, os.PathLike)) else None)
+    source = load_source(path_or_data, obs=obs, action=action, episode=episode, format=format, filter_key=filter_key)
+    numbers: dict[str, Any] = {"starts": starts, "folds": folds, "updates": updates, "batch_size": batch_size}
+    numbers |= {"components": 6 if components is None else components, "seed": seed}
+    with new_folder(out, overwrite=overwrite) as folder:
+        found = find_modes(source.data, **numbers, always=components is not None, device=device, progress=progress)
+        lengths = source.episodes().lengths.tolist()
+        number = found.of_episodes
+        member = found.membership[number, torch.arange(len(number))]
+        columns = (source.names, lengths, number.tolist(), member.tolist(), found.gain.tolist())
+        write_csv(folder / "modes.csv", MODES, zip(range(len(number)), *columns, strict=True))
+        write_json(folder / "summary.json", describe(found, lengths, components is not None))
+        write_json(
+            folder / RUN,
+            {
+                "format": FORMAT,
+                "kind": KIND,
+                "method": {"rating": "peak", "beta": BETA},
+                "data": source.to_json(),
+                "train": {**numbers, "lr": LR},
+                "versions": versions(),
+                "command": command or "torchrl_tsallis.run.modes",
+            },
+        )
+    return ModesFolder.open(out)
+
+
+def describe(found: Modes, lengths: Sequence[int], asked: bool = False) -> dict[str, Any]:
+    """What ``summary.json`` says: the modes, the one to imitate, and how sure both are.
+
+    Args:
+        found: the modes.
+        lengths: steps of each episode.
+        asked: whether modes were asked for, whatever the held-out episodes say.
+    """
+    share, certainty, z = found.share.tolist(), found.certainty.tolist(), signed_rank(found.gain)
+    listed = [
+        {
+            "mode": k,
+            "episodes": len(group),
+            "steps": sum(lengths[e] for e in group),
+            "share": share[k],
+            "certainty": certainty[k],
+        }
+        for k, group in enumerate(found.groups)
+    ]
+    best = found.recommended
+    rest = max((share[k] for k in range(len(share)) if k != best), default=0.0)
+    reasons = []
+    if len(found.groups) > 1:
+        if certainty[best] < CERTAIN:
+            reasons.append(f"the starts agree on it by {certainty[best]:.2f} only (1 is always)")
+        if share[best] < LARGER * rest:
+            reasons.append("another mode is about as large")
+        if z <= SURE:
+            reasons.append("modes do not explain held-out episodes better than as many policies without them")
+    large = [mode for mode in listed if mode["episodes"] > 1]
+    alone = len(listed) - len(large)
+    if len(found.groups) == 1:
+        sentence = f"One mode: modes do not explain held-out episodes better (z = {z:.1f}, over {SURE:g} is needed)."
+    else:
+        text = ", ".join(f"{mode['mode']} ({mode['episodes']} episodes)" for mode in large)
+        sentence = (
+            f"{len(large)} modes of more than one episode: {text}; {alone} episodes are alone. Imitate mode {best}"
+        )
+        sentence += f", with care: {'; '.join(reasons)}." if reasons else "."
+    return {
+        "modes": listed,
+        "recommended": best,
+        "sure": not reasons,
+        "reasons": reasons,
+        "agreement": found.agreement,
+        "z": z,
+        "asked": asked,
+        "sentence": sentence,
+    }
+
+
+def mode_source(folder: str | os.PathLike[str], mode: int) -> Source:
+    """The demonstrations of one mode, read again from where they were.
+
+    Args:
+        folder: that :func:`modes` left.
+        mode: number of the mode.
+
+    Returns:
+        The rows of its episodes, with their names.
+
+    Raises:
+        FileNotFoundError: if folder or data are not there.
+        ValueError: if there is no such mode, the data were in memory, or they are others now.
+    """
+    check_number("mode", mode, low=0, integer=True)
+    found = ModesFolder.open(folder)
+    names, about = found.episodes_of(mode), found.run["data"]
+    if about["format"] == "memory":
+        raise ValueError(f"the data of {str(folder)!r} were in memory: save them, and find the modes of the file")
+    keys = about["keys"]
+    action = keys["action"] if len(keys["action"]) > 1 else keys["action"][0]
+    chosen = {"episode": about.get("episode"), "filter_key": about.get("filter_key"), "format": about["format"]}
+    source = load_source(about["path"], obs=keys["observation"], action=action, **chosen)
+    if identity(source.data) != about["identity"]:
+        raise ValueError(f"{about['path']!r} has changed since its modes were found: find them again")
+    own = torch.tensor([name in set(names) for name in source.names])
+    data = take_rows(source.data, own[source.episodes().of_rows()])
+    return replace(source, data=data, names=tuple(names), chosen={**source.chosen, "mode": str(mode)})
