@@ -156,6 +156,12 @@ class Modes(Reads):
             command=command_line(words),
         )
         lines = [found.summary["sentence"], str(self.out / "modes.csv")]
+        try:
+            from torchrl_tsallis.report.modes import write_modes_picture
+
+            lines.append(str(write_modes_picture(self.out)))
+        except ImportError as error:
+            note(f"no picture: {error}")
         if len(found.summary["modes"]) > 1:
             best = found.summary["recommended"]
             lines.append(f"tsallis curate {self.out} --mode {best} --out COPY    # that mode alone, in the same format")

@@ -19,7 +19,7 @@ from torchrl_tsallis.jobs.files import atomic_path, disk_errors
 #: The file that makes a folder a run, and the format that this package writes.
 RUN, FORMAT = "run.json", 1
 #: What a run, its report and its card consist of; pictures and logs are recognised by their endings.
-FILES = (RUN, "policy.safetensors", "rating.safetensors", "target.safetensors", "scaling.json")
+FILES = (RUN, "policy.safetensors", "rating.safetensors", "target.safetensors", "scaling.json", "pairs.safetensors")
 TABLES = ("ratings.csv", "episodes.csv", "modes.csv", "summary.json")
 _OTHERS, _ENDINGS = ("report.html", "README.md"), (".png", ".svg")
 

@@ -17,7 +17,7 @@ from torchrl_tsallis.modes.find import BETA, LR, SURE, UPDATES, find_modes
 from torchrl_tsallis.modes.found import Modes, signed_rank
 from torchrl_tsallis.runs.folder import FORMAT, RUN, check_free, new_folder, write_csv, write_json
 from torchrl_tsallis.runs.members import check_device
-from torchrl_tsallis.runs.saved import versions
+from torchrl_tsallis.runs.saved import save_tensors, versions
 from torchrl_tsallis.runs.source import Source, identity, load_source
 
 #: Certainty of a mode, and how much larger than the next one it has to be, for a recommendation that is sure.
@@ -94,6 +94,7 @@ def modes(
         member = found.membership[number, torch.arange(len(number))]
         columns = (source.names, lengths, number.tolist(), member.tolist(), found.gain.tolist())
         write_csv(folder / "modes.csv", MODES, zip(range(len(number)), *columns, strict=True))
+        save_tensors(folder / "pairs.safetensors", {"pairs": found.pairs.float()})
         write_json(folder / "summary.json", describe(found, lengths, components is not None))
         write_json(
             folder / RUN,

@@ -1,0 +1,90 @@
+"""A picture of the modes among demonstrations: who belongs together, and how sure that is."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from torchrl_tsallis.data.modes_folder import ModesFolder
+from torchrl_tsallis.jobs.files import atomic_path
+from torchrl_tsallis.report.figures import new_figure
+from torchrl_tsallis.report.svg import MUTED
+from torchrl_tsallis.runs.saved import load_tensors
+
+#: Colours of the largest modes that can be told apart without seeing red and green; all others are grey.
+COLOURS = ("#0072b2", "#e69f00", "#009e73", "#cc79a7", "#56b4e9", "#d55e00", "#f0e442")
+
+
+def colour_of(mode: int, episodes: int) -> str:
+    """Colour of a mode: grey for an episode alone, and for modes after the seventh.
+
+    Examples:
+        >>> colour_of(0, 5), colour_of(1, 1) == MUTED
+        ('#0072b2', True)
+    """
+    return COLOURS[mode] if episodes > 1 and mode < len(COLOURS) else MUTED
+
+
+def draw_together(axes: Any, pairs: np.ndarray, mode: np.ndarray) -> None:
+    """How often two episodes are of one component, with the episodes of a mode side by side.
+
+    Args:
+        axes: to draw on.
+        pairs: ``[E, E]``, in [0, 1].
+        mode: of each episode, ``[E]``.
+    """
+    order = np.argsort(mode, kind="stable")
+    image = axes.imshow(pairs[order][:, order], cmap="Blues", vmin=0, vmax=1, interpolation="none")
+    for edge in np.flatnonzero(np.diff(mode[order])) + 0.5:
+        axes.axhline(edge, color=MUTED, linewidth=0.5)
+        axes.axvline(edge, color=MUTED, linewidth=0.5)
+    axes.set(xlabel="episode, by mode", ylabel="episode, by mode", title="how often together, over starts")
+    axes.figure.colorbar(image, ax=axes, shrink=0.8)
+
+
+def draw_modes(axes: Any, mode: np.ndarray, membership: np.ndarray) -> None:
+    """Episodes in the order of the data: a bar in the colour of its mode, as high as its membership.
+
+    Args:
+        axes: to draw on.
+        mode: of each episode, ``[E]``.
+        membership: of each episode in its mode, ``[E]``.
+    """
+    count = np.bincount(mode)
+    colours = [colour_of(k, count[k]) for k in mode.tolist()]
+    # An episode alone has no membership: a stub says that it is there.
+    axes.bar(np.arange(len(mode)), np.maximum(membership, 0.03), color=colours, width=0.9)
+    axes.set(xlabel="episode, in the order of the data", ylabel="membership in its mode", ylim=(0, 1.02))
+    shown = [k for k in range(min(len(count), len(COLOURS))) if count[k] > 1]
+    for k in shown:
+        axes.bar([0], [0], color=COLOURS[k], label=f"mode {k}: {count[k]} episodes")
+    if (alone := int((count == 1).sum())) > 0:
+        axes.bar([0], [0], color=MUTED, label=f"{alone} alone")
+    axes.legend(fontsize=8, ncols=3, loc="upper center", bbox_to_anchor=(0.5, 1.18), frameon=False)
+
+
+def write_modes_picture(folder: str | os.PathLike[str]) -> Path:
+    """Draws ``modes.png`` of a folder that ``tsallis modes`` left.
+
+    Args:
+        folder: of the modes.
+
+    Returns:
+        The picture.
+
+    Raises:
+        ImportError: if matplotlib is not installed.
+        FileNotFoundError: if it is no such folder.
+    """
+    found = ModesFolder.open(folder)
+    pairs = load_tensors(found.path / "pairs.safetensors")["pairs"].numpy()
+    figure, (left, right) = new_figure(10, 4, columns=2)
+    draw_together(left, pairs, found.mode)
+    draw_modes(right, found.mode, found.membership)
+    place = found.path / "modes.png"
+    with atomic_path(place) as path, open(path, "wb") as file:
+        figure.savefig(file, format="png")
+    return place
