@@ -66,7 +66,6 @@ def search(key: Key, cfg: DictConfig) -> None:
         returns = {k: evaluated(rows, modes[episode] != k, key.seed, cfg) for k in large}
         member = found.membership[modes, torch.arange(len(modes))]
         answer = {
-            "gain": found.gain.tolist(),
             "agreement": found.agreement,
             "recommended": found.recommended,
             "mode": modes.tolist(),

@@ -19,7 +19,7 @@ from torchrl_tsallis.modes import adjusted_rand_index
 
 RETURNS = ("method", "trio", "task", "std", "seed", "component", "share", "recommended", "episode", "return")
 ASSIGNED = ("trio", "task", "std", "seed", "agreement", "episode", "demonstrator", "mode",
-            "membership", "gain")  # fmt: skip
+            "membership")  # fmt: skip
 #: Policies of all demonstrations that the modes' are compared with.
 OTHERS = {"bc": "BC", "proposal": "proposal", "peak": "peak, tuned"}
 Rows = list[dict[str, Any]]
@@ -37,10 +37,10 @@ def write_rows(folder: Path, answers: Mapping[Key, Mapping[str, Any]]) -> None:
             about["recommended"] = int(int(component) == answer["recommended"])
             rows = [{"episode": k, "return": f"{value:.3f}"} for k, value in enumerate(values)]
             returns += [{"method": "modes", **cell, **about, **row} for row in rows]
-        per_episode = zip(modes, answer["expert"], answer["membership"], answer["gain"], strict=True)
-        for episode, (mode, who, share, gain) in enumerate(per_episode):
+        per_episode = zip(modes, answer["expert"], answer["membership"], strict=True)
+        for episode, (mode, who, share) in enumerate(per_episode):
             line = {"agreement": f"{answer['agreement']:.4f}", "episode": episode, "demonstrator": who, "mode": mode}
-            assigned.append({**cell, **line, "membership": f"{share:.4f}", "gain": f"{gain:.4f}"})
+            assigned.append({**cell, **line, "membership": f"{share:.4f}"})
     for name, columns, rows in (("modes.csv", RETURNS, returns), ("modes_assignments.csv", ASSIGNED, assigned)):
         text = io.StringIO()
         writer = csv.DictWriter(text, columns, lineterminator="\n")

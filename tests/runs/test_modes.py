@@ -96,20 +96,17 @@ def test_data_that_have_changed_since_are_refused(file, folder, tmp_path):
         ModesFolder.open(copy)
 
 
-def described(groups, pairs, gain):
+def described(groups, pairs, starts):
     pairs = torch.tensor(pairs, dtype=torch.float64)
-    starts = torch.zeros(2, len(pairs), dtype=torch.int64)
-    return describe(Modes(groups, pairs, starts, torch.zeros(len(pairs)), torch.tensor(gain)), [10] * len(pairs))
+    return describe(Modes(groups, pairs, torch.tensor(starts)), [10] * len(pairs))
 
 
-def test_a_recommendation_says_why_it_is_not_sure():
-    together = [[1.0, 1.0, 0.0], [1.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
-    sure = described(((0, 1), (2,)), together, [1.0, 1.0, 1.0])
-    assert not sure["sure"] and sure["reasons"] == [
-        "modes do not explain held-out episodes better than as many policies without them"
-    ]  # three episodes are too few: z = (6 - 3) / sqrt(3.5)
+def test_a_recommendation_says_how_sure_it_is():
+    pairs = [[1.0, 1.0, 1.0, 0.0], [1.0, 1.0, 1.0, 0.0], [1.0, 1.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
+    sure = described(((0, 1, 2), (3,)), pairs, [[0, 0, 0, 1]] * 2)
+    assert sure["sure"] and sure["recommended"] == 0 and sure["sentence"].endswith("Imitate mode 0.")
     half = [[1.0, 0.6, 0.0, 0.0], [0.6, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.5], [0.0, 0.0, 0.5, 1.0]]
-    found = described(((0, 1), (2, 3)), half, [-1.0] * 4)
+    found = described(((0, 1), (2, 3)), half, [[0, 0, 1, 1], [0, 1, 0, 1]])
     assert found["recommended"] == 0 and len(found["reasons"]) == 3 and "with care" in found["sentence"]
-    one = described(((0, 1, 2),), [[1.0] * 3] * 3, [-1.0, 1.0, -1.0])
+    one = described(((0, 1, 2, 3),), half, [[0, 0, 1, 1], [0, 1, 0, 1]])
     assert one["sure"] and one["recommended"] == 0 and one["sentence"].startswith("One mode")

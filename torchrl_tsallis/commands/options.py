@@ -142,15 +142,13 @@ class ModesTraining:
     """How the mixtures are trained.
 
     Args:
-        starts: of the mixture on everything, on which modes have to agree.
-        folds: of the episodes, for the test whether one mode is enough.
+        starts: of mixtures, which have to agree on the modes.
         updates: of the responsibilities, an epoch between two.
         batch_size: samples a step and component.
-        seed: of folds, starts and policies.
+        seed: of starts and policies.
     """
 
-    starts: int = 3
-    folds: int = 3
+    starts: int = 4
     updates: int = 60
     batch_size: int = 256
     seed: int = 0

@@ -11,7 +11,7 @@ import numpy as np
 
 from torchrl_tsallis.data.ratings_folder import RatingsFolder, numbers_of, read_table, read_text
 
-_COLUMNS = ("episode", "source", "steps", "mode", "membership", "gain")
+_COLUMNS = ("episode", "source", "steps", "mode", "membership")
 KIND = "modes"
 
 

@@ -18,28 +18,17 @@ class Modes:
         groups: episodes of each mode; the largest mode first. An episode that no mode shares is a group of its own.
         pairs: how often two episodes were of one component, over the starts, ``[E, E]``.
         starts: component of each episode in each start, ``[K, E]``.
-        one: log-likelihood a step of each held-out episode under policies that all have the same data, ``[E]``.
-        several: the same under a mixture, ``[E]``.
     """
 
     groups: tuple[tuple[int, ...], ...]
     pairs: Tensor
     starts: Tensor
-    one: Tensor
-    several: Tensor
-
-    @property
-    def gain(self) -> Tensor:
-        """By how many nats a step the mixture explains each held-out episode better, ``[E]``."""
-        return self.several - self.one
 
     @property
     def agreement(self) -> float:
-        """Mean adjusted Rand index between the starts; 1 with one mode."""
-        if len(self.groups) == 1:
-            return 1.0
+        """Mean adjusted Rand index between the starts: about 0 where each splits the episodes in a way of its own."""
         found = [adjusted_rand_index(a, b) for k, a in enumerate(self.starts) for b in self.starts[k + 1 :]]
-        return sum(found) / len(found) if found else 1.0
+        return sum(found) / len(found)
 
     @property
     def of_episodes(self) -> Tensor:
@@ -78,33 +67,3 @@ class Modes:
     def recommended(self) -> int:
         """The mode to imitate where nothing is known of returns: the largest share times certainty."""
         return int((self.share * self.certainty).argmax())
-
-
-def signed_rank(value: Tensor) -> float:
-    r"""How sure it is that values lie above 0: Wilcoxon's signed-rank statistic, standardised.
-
-    .. math:: z = \frac{W_+ - n (n + 1) / 4}{\sqrt{n (n + 1) (2 n + 1) / 24}}
-
-    with the sum :math:`W_+` of the ranks that the positive ones of n values have by size. No single value decides,
-    which a mean of few, unequal episodes would let happen.
-
-    Source: Wilcoxon, "Individual Comparisons by Ranking Methods", Biometrics Bulletin 1(6), 1945.
-
-    Args:
-        value: ``[n]``. Equal sizes have their mean rank; zeros are left out.
-
-    Returns:
-        z, about normal if values are as often above 0 as below; 0 where there is no value.
-
-    Examples:
-        >>> round(signed_rank(torch.tensor([1.0, 2.0, -3.0, 4.0])), 4)  # (1 + 2 + 4 - 5) / sqrt(7.5)
-        0.7303
-    """
-    value = value[value != 0].double()
-    n = len(value)
-    if not n:
-        return 0.0
-    size = value.abs()
-    rank = (size[:, None] > size).sum(1) + ((size[:, None] == size).sum(1) + 1) / 2
-    positive = float(rank[value > 0].sum())
-    return (positive - n * (n + 1) / 4) / (n * (n + 1) * (2 * n + 1) / 24) ** 0.5

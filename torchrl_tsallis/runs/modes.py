@@ -13,8 +13,8 @@ from tensordict import TensorDictBase
 from torchrl_tsallis._checks import check_number
 from torchrl_tsallis.data.modes_folder import KIND, ModesFolder
 from torchrl_tsallis.data.rows import take_rows
-from torchrl_tsallis.modes.find import BETA, LR, SURE, UPDATES, find_modes
-from torchrl_tsallis.modes.found import Modes, signed_rank
+from torchrl_tsallis.modes.find import AGREE, BETA, LR, UPDATES, find_modes
+from torchrl_tsallis.modes.found import Modes
 from torchrl_tsallis.runs.folder import FORMAT, RUN, check_free, new_folder, write_csv, write_json
 from torchrl_tsallis.runs.members import check_device
 from torchrl_tsallis.runs.saved import save_tensors, versions
@@ -22,7 +22,7 @@ from torchrl_tsallis.runs.source import Source, identity, load_source
 
 #: Certainty of a mode, and how much larger than the next one it has to be, for a recommendation that is sure.
 CERTAIN, LARGER = 0.8, 1.25
-MODES = ("episode", "source", "steps", "mode", "membership", "gain")
+MODES = ("episode", "source", "steps", "mode", "membership")
 
 
 def modes(
@@ -35,8 +35,7 @@ def modes(
     format: str | None = None,
     filter_key: str | None = None,
     components: int | None = None,
-    starts: int = 3,
-    folds: int = 3,
+    starts: int = 4,
     updates: int = UPDATES,
     batch_size: int = 256,
     seed: int = 0,
@@ -56,11 +55,10 @@ def modes(
         format: name of the format.
         filter_key: subset of the file's episodes.
         components: of each mixture. Default: 6, and one mode where that is enough.
-        starts: of the mixture on everything.
-        folds: of the episodes.
+        starts: of mixtures.
         updates: of the responsibilities, an epoch between two.
         batch_size: samples a step and component.
-        seed: of folds, starts and policies.
+        seed: of starts and policies.
         device: of the policies.
         progress: whether to show bars.
         overwrite: whether an earlier run in ``out`` is replaced, once this one is done.
@@ -85,14 +83,14 @@ def modes(
     check_device(device)
     check_free(out, overwrite, path_or_data if isinstance(path_or_data, (str, os.PathLike)) else None)
     source = load_source(path_or_data, obs=obs, action=action, episode=episode, format=format, filter_key=filter_key)
-    numbers: dict[str, Any] = {"starts": starts, "folds": folds, "updates": updates, "batch_size": batch_size}
+    numbers: dict[str, Any] = {"starts": starts, "updates": updates, "batch_size": batch_size}
     numbers |= {"components": 6 if components is None else components, "seed": seed}
     with new_folder(out, overwrite=overwrite) as folder:
         found = find_modes(source.data, **numbers, always=components is not None, device=device, progress=progress)
         lengths = source.episodes().lengths.tolist()
         number = found.of_episodes
         member = found.membership[number, torch.arange(len(number))]
-        columns = (source.names, lengths, number.tolist(), member.tolist(), found.gain.tolist())
+        columns = (source.names, lengths, number.tolist(), member.tolist())
         write_csv(folder / "modes.csv", MODES, zip(range(len(number)), *columns, strict=True))
         save_tensors(folder / "pairs.safetensors", {"pairs": found.pairs.float()})
         write_json(folder / "summary.json", describe(found, lengths, components is not None))
@@ -117,9 +115,9 @@ def describe(found: Modes, lengths: Sequence[int], asked: bool = False) -> dict[
     Args:
         found: the modes.
         lengths: steps of each episode.
-        asked: whether modes were asked for, whatever the held-out episodes say.
+        asked: whether modes were asked for, however little the starts agree.
     """
-    share, certainty, z = found.share.tolist(), found.certainty.tolist(), signed_rank(found.gain)
+    share, certainty = found.share.tolist(), found.certainty.tolist()
     listed = [
         {
             "mode": k,
@@ -138,12 +136,14 @@ def describe(found: Modes, lengths: Sequence[int], asked: bool = False) -> dict[
             reasons.append(f"the starts agree on it by {certainty[best]:.2f} only (1 is always)")
         if share[best] < LARGER * rest:
             reasons.append("another mode is about as large")
-        if z <= SURE:
-            reasons.append("modes do not explain held-out episodes better than as many policies without them")
+        if found.agreement < AGREE:
+            reasons.append("the starts hardly agree on anything, as where there is one mode")
     large = [mode for mode in listed if mode["episodes"] > 1]
     alone = len(listed) - len(large)
     if len(found.groups) == 1:
-        sentence = f"One mode: modes do not explain held-out episodes better (z = {z:.1f}, over {SURE:g} is needed)."
+        sentence = (
+            f"One mode: the starts do not agree on several ({found.agreement:.2f}, at least {AGREE:g} is needed)."
+        )
     else:
         text = ", ".join(f"{mode['mode']} ({mode['episodes']} episodes)" for mode in large)
         sentence = (
@@ -156,7 +156,6 @@ def describe(found: Modes, lengths: Sequence[int], asked: bool = False) -> dict[
         "sure": not reasons,
         "reasons": reasons,
         "agreement": found.agreement,
-        "z": z,
         "asked": asked,
         "sentence": sentence,
     }
