@@ -6,6 +6,11 @@ killed and started again; what is done is not done twice::
     python recipes/ant_modes.py
     python recipes/ant_modes.py part=[gaits] seeds=[200,201]
 
+On a GPU the search of several seeds is one program; the policies, which are small, may be trained elsewhere::
+
+    python recipes/ant_modes.py mode=find device=cuda block=5 workers=4
+    python recipes/ant_modes.py
+
 The tables from the raw files alone::
 
     python recipes/ant_modes.py mode=report results=docs/results
@@ -20,78 +25,18 @@ from pathlib import Path
 from typing import Any
 
 import hydra
-import torch
-from ant_common import check_names, demonstrations, task_data
+from ant_common import check_names, demonstrations
 from ant_sweep import of_condition
 from ant_units import Key
 from common import as_list, keep_settings
+from modes_cell import evaluate, file_of, search
 from modes_report import read_rows, report, write_rows
 from omegaconf import DictConfig, OmegaConf
-from torchrl import torchrl_logger
 
-from torchrl_tsallis.data import find_episodes
-from torchrl_tsallis.data.rows import take_rows
-from torchrl_tsallis.envs import make_ant
-from torchrl_tsallis.evaluation import evaluate_policies
-from torchrl_tsallis.jobs import atomic_path, run_jobs, tick
-from torchrl_tsallis.modes import find_modes
-from torchrl_tsallis.runs.members import Split, train_members
-from torchrl_tsallis.runs.policies import ScaledMeanPolicy
-from torchrl_tsallis.trainers import keep_freed_memory
+from torchrl_tsallis.jobs import run_jobs
 
 #: Options that decide about a cell's result.
 SETTINGS = ("search", "smallest", "updates", "epochs", "batch_size", "data", "evaluation")
-
-
-def labels_of(data: Any, starts: torch.Tensor, amateur: int) -> list[int]:
-    """Who demonstrated each episode; the amateur is the last."""
-    info, names = data["info"], set(data["info"].keys())
-    expert = info["expert"][starts].reshape(-1)
-    by_amateur = info["is_amateur"][starts].reshape(-1) if "is_amateur" in names else expert < 0
-    return expert.where(~by_amateur, torch.full_like(expert, amateur)).tolist()
-
-
-def search(key: Key, cfg: DictConfig) -> None:
-    """Finds the modes of one cell and seed, and evaluates a policy of each, in a process of its own."""
-    torchrl_logger.setLevel("ERROR")
-    keep_freed_memory()
-    file = file_of(key, cfg)
-    if not file.exists():
-        data = task_data(key.task, of_condition(cfg, key), key.seed)
-        rows = data.select("observation", "action").set("episode", torch.arange(len(data)) // cfg.data.length)
-        starts = find_episodes(rows).starts
-        found = find_modes(rows, **cfg.search, updates=cfg.updates, batch_size=cfg.batch_size, seed=key.seed)
-        modes, episode = found.of_episodes, rows["episode"]
-        large = [k for k, group in enumerate(found.groups) if len(group) >= cfg.smallest or k == found.recommended]
-        returns = {k: evaluated(rows, modes[episode] != k, key.seed, cfg) for k in large}
-        member = found.membership[modes, torch.arange(len(modes))]
-        answer = {
-            "agreement": found.agreement,
-            "recommended": found.recommended,
-            "mode": modes.tolist(),
-            "membership": member.tolist(),
-            "expert": labels_of(data, starts, len(cfg.trios[key.trio]) - 1),
-            "returns": returns,
-        }
-        with atomic_path(file) as path:
-            path.write_text(json.dumps(answer))
-    tick()
-
-
-def evaluated(rows: Any, left_out: torch.Tensor, seed: int, cfg: DictConfig) -> list[float]:
-    """Returns of the policy that is trained on the other rows, for as many passes over them as those of a recipe."""
-    kept = take_rows(rows, ~left_out)
-    steps = cfg.epochs * max(1, len(kept) // cfg.batch_size)
-    split = Split(seed, torch.zeros(len(kept), dtype=torch.bool))
-    members = train_members(kept, [split], steps=steps, batch_size=cfg.batch_size, device=cfg.device)
-    policy = ScaledMeanPolicy.of(members.actor_state(0), members.scalings[0])
-    options = {"episodes": cfg.evaluation.episodes, "seed": cfg.evaluation.seed, "workers": 0, "progress": False}
-    return [row["return"] for row in evaluate_policies({"mode": policy}, env_fn=make_ant, **options)]
-
-
-def file_of(key: Key, cfg: DictConfig) -> Path:
-    """Where a cell's answer is kept."""
-    return Path(cfg.output).absolute() / "cells" / key.trio / f"std_{key.std:g}" / key.task / f"seed_{key.seed}.json"
 
 
 def wanted_of(cfg: DictConfig) -> list[Key]:
@@ -116,9 +61,15 @@ def run(cfg: DictConfig, keys: list[Key]) -> None:
     keep_settings(Path(cfg.output) / "settings.json", settings, SETTINGS)
     for key in dict.fromkeys(key._replace(task="", seed=0) for key in keys):  # recorded once, not by each worker
         demonstrations(of_condition(cfg, key), cfg.progress)
-    bar = {"desc": "finding modes", "unit": "cell", "progress": cfg.progress, "workers": cfg.workers}
+    blocks: dict[tuple[Any, ...], list[Key]] = {}
+    for key in keys:
+        blocks.setdefault((*key._replace(seed=0), cfg.seeds.index(key.seed) // cfg.block), []).append(key)
+    bar = {"unit": "cell", "progress": cfg.progress, "workers": cfg.workers}
     try:
-        run_jobs(partial(search, cfg=cfg), keys, total=len(keys), **bar)
+        jobs = list(map(tuple, blocks.values()))
+        run_jobs(partial(search, cfg=cfg), jobs, total=len(jobs), desc="finding modes", **bar)
+        if cfg.mode == "run":
+            run_jobs(partial(evaluate, cfg=cfg), keys, total=len(keys), desc="letting them walk", **bar)
     except KeyboardInterrupt:
         raise SystemExit("interrupted: the same command goes on with what is missing") from None
 
@@ -127,12 +78,18 @@ def run(cfg: DictConfig, keys: list[Key]) -> None:
 def main(cfg: DictConfig) -> None:
     """Runs and shows, or only shows."""
     results = Path(cfg.results)
-    if cfg.mode == "run":
+    if cfg.mode not in ("run", "find", "report"):
+        raise SystemExit(f"no mode {cfg.mode!r}: choose run, find or report")
+    if cfg.mode != "report":
         keys = wanted_of(cfg)
         run(cfg, keys)
-        write_rows(results, {key: json.loads(file_of(key, cfg).read_text()) for key in keys})
-    elif cfg.mode != "report":
-        raise SystemExit(f"no mode {cfg.mode!r}: choose run or report")
+    if cfg.mode == "find":
+        return
+    if cfg.mode == "run":
+        parts = {
+            key: [json.loads(file_of(key, name, cfg).read_text()) for name in ("found", "returns")] for key in keys
+        }
+        write_rows(results, {key: found | {"returns": returns} for key, (found, returns) in parts.items()})
     print(report(*read_rows(results), results, known=Path(cfg.known)))
     print(f"raw returns, assignments and tables in {results}")
 

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from tests.modes.test_mixture import demonstrations
-from torchrl_tsallis.modes import Modes, adjusted_rand_index, find_modes
+from torchrl_tsallis.modes import Modes, adjusted_rand_index, find_modes, find_modes_of_each
 
 
 def modes_of(groups, pairs, starts=((0, 0, 1, 1), (1, 1, 0, 0))):
@@ -53,7 +53,7 @@ def test_demonstrators_are_told_apart_in_any_unit(unit):
 
 def test_demonstrations_of_one_kind_are_not_split():
     data, _ = demonstrations((6, 6), sign=(1.0, 1.0))
-    found = find_modes(data, components=3, starts=3, updates=30, batch_size=32)
+    found = find_modes(data, components=3, starts=4, updates=30, batch_size=32)
     assert found.groups == (tuple(range(12)),) and found.recommended == 0
     assert found.agreement < 0.2 and found.membership.tolist() == [[1.0] * 12]
 
@@ -67,12 +67,27 @@ def test_the_same_seed_gives_the_same_modes_and_leaves_random_numbers_alone():
     assert first.groups == again.groups and first.pairs.equal(again.pairs)
 
 
+def test_sets_beside_one_another_are_found_as_each_alone():
+    sets = [demonstrations((6, 6), seed=seed)[0] for seed in (0, 1)]
+    options = {"components": 2, "starts": 2, "updates": 4, "batch_size": 16, "always": True}
+    both = find_modes_of_each(sets, seeds=[5, 7], **options)
+    assert not both[0].pairs.allclose(both[1].pairs, atol=1e-2)
+    for data, seed, found in zip(sets, (5, 7), both, strict=True):
+        alone = find_modes(data, seed=seed, **options)
+        assert found.pairs.allclose(alone.pairs, atol=1e-4) and found.groups == alone.groups
+
+
+def test_a_seed_a_set_is_asked_for():
+    data, _ = demonstrations()
+    with pytest.raises(ValueError, match="1 sets and 2 seeds: give one seed a set"):
+        find_modes_of_each([data], seeds=[0, 1])
+
+
 @pytest.mark.parametrize(
     ("name", "value"),
     [
         ("components", 1),
         ("starts", 1),
-        ("folds", 1),
         ("updates", 0),
         ("threshold", 0.0),
         ("seed", -1),

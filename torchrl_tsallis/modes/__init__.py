@@ -1,12 +1,13 @@
 """Modes of behaviour in demonstrations, found without labels: mixtures of policies over whole episodes."""
 
 from torchrl_tsallis.modes.consensus import adjusted_rand_index, consensus, together
-from torchrl_tsallis.modes.find import find_modes, train_mixtures
+from torchrl_tsallis.modes.find import find_modes, find_modes_of_each
 from torchrl_tsallis.modes.found import Modes
 from torchrl_tsallis.modes.likelihood import episode_means, robust_log_prob
 from torchrl_tsallis.modes.mixture import EpisodeMixture
 from torchrl_tsallis.modes.responsibilities import Annealing, random_responsibilities, responsibilities
 from torchrl_tsallis.modes.sampler import EpisodeSampler, make_episode_buffer
+from torchrl_tsallis.modes.train import train_mixtures
 
 __all__ = [
     "Annealing",
@@ -17,6 +18,7 @@ __all__ = [
     "consensus",
     "episode_means",
     "find_modes",
+    "find_modes_of_each",
     "make_episode_buffer",
     "random_responsibilities",
     "responsibilities",

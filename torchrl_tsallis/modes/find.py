@@ -4,36 +4,23 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
-from torch import Tensor
 
 from torchrl_tsallis._checks import check_number
 from torchrl_tsallis.data.episodes import find_episodes
 from torchrl_tsallis.data.robust_scaling import RobustScaling
 from torchrl_tsallis.modes.consensus import consensus, together
 from torchrl_tsallis.modes.found import Modes
-from torchrl_tsallis.modes.mixture import EpisodeMixture
-from torchrl_tsallis.modes.responsibilities import Annealing
-from torchrl_tsallis.modes.sampler import make_episode_buffer
-from torchrl_tsallis.modules.policy import make_policy
-from torchrl_tsallis.objectives.bc import TsallisBCLoss
-from torchrl_tsallis.optim.adaterm import AdaTerm
-from torchrl_tsallis.ratings.peak import PeakRating
-from torchrl_tsallis.ratings.score_tuner import ScoreTuner
-from torchrl_tsallis.trainers.hooks import undisturbed
-from torchrl_tsallis.trainers.offline import make_offline_trainer
+from torchrl_tsallis.modes.train import train_mixtures
 
-#: Power of the scale-weighted likelihood, and the size of AdaTerm's steps, as where single policies are trained.
-BETA, LR = 0.5, 1e-3
 #: Updates of the responsibilities.
 UPDATES = 60
 #: Least share of starts in which the episodes of a mode are together, and least agreement between starts (of which 0 is
 #: chance) for more than one mode; measured, see docs/modes.md.
 TOGETHER, AGREE = 0.4, 0.2
-#: Fewest steps between two updates.
-LEAST_STEPS = 20
 
 
 def find_modes(
@@ -85,73 +72,75 @@ def find_modes(
         >>> sum(map(len, found.groups))
         12
     """
-    numbers = {"components": (components, 2), "starts": (starts, 2), "updates": (updates, 1)}
-    for name, (value, low) in (numbers | {"batch_size": (batch_size, 1), "seed": (seed, 0)}).items():
-        check_number(name, value, low=low, integer=True)
-    check_number("threshold", threshold, above=0, high=1)
-    episodes = find_episodes(data, purpose="a search for modes", open_end=True)
-    count = len(episodes.starts)
-    if count < 6:
-        raise ValueError(f"{count} episodes are too few to find modes among them: record at least 6")
-    components = min(components, count // 3)
-    sizes = [components if k % 2 == 0 else max(2, 2 * components // 3) for k in range(starts)]
-    rows = data.select("observation", "action")
-    scaled = RobustScaling.fit(rows)(rows).set("episode", episodes.of_rows())
-    mixture = train_mixtures(
-        scaled, sizes, seed=seed, updates=updates, batch_size=batch_size, device=device, progress=progress
-    )
-    found = list(mixture.responsibilities.split(sizes))
-    pairs = together(found)
-    modes = Modes(tuple(map(tuple, consensus(pairs, threshold))), pairs, torch.stack([x.argmax(0) for x in found]))
-    if always or modes.agreement >= AGREE:
-        return modes
-    return replace(modes, groups=(tuple(range(count)),))
+    options: dict[str, Any] = {"components": components, "starts": starts, "batch_size": batch_size, "updates": updates}
+    options |= {"threshold": threshold, "always": always, "device": device, "progress": progress}
+    return find_modes_of_each([data], seeds=[seed], **options)[0]
 
 
-def train_mixtures(
-    scaled: TensorDictBase,
-    sizes: Sequence[int],
+def find_modes_of_each(
+    sets: Sequence[TensorDictBase],
     *,
-    seed: int,
-    updates: int,
+    seeds: Sequence[int],
+    components: int = 6,
+    starts: int = 4,
     batch_size: int = 256,
-    known: Tensor | None = None,
+    updates: int = UPDATES,
+    threshold: float = TOGETHER,
+    always: bool = False,
     device: str | torch.device = "cpu",
     progress: bool = False,
-) -> EpisodeMixture:
-    """Trains mixtures beside one another, as stacked members of one program.
+) -> list[Modes]:
+    """:func:`find_modes` of several sets that have nothing in common, as one program, which pays on a GPU.
+
+    What is found is the same as in one set after the other, up to rounding, where the sets are equally long.
 
     Args:
-        scaled: ``observation``, ``action`` and ``episode``, ``[N]``, as the policies take them.
-        sizes: components of each mixture.
-        seed: of the first parameters, the samples and the soft starts.
-        updates: of the responsibilities, an epoch between two.
-        batch_size: samples a step and component.
-        known: episodes that each mixture may learn from, ``[G, E]`` bool. Default: all.
-        device: of the policies.
-        progress: whether to show a bar.
+        sets: of demonstrations of the same robot, each as there.
+        seeds: one a set.
+        components: as there.
+        starts: as there.
+        batch_size: as there.
+        updates: as there.
+        threshold: as there.
+        always: as there.
+        device: as there.
+        progress: as there.
 
     Returns:
-        The mixtures, with their loss.
+        The modes of each set.
+
+    Raises:
+        ValueError: as there, or if there is not a seed a set.
     """
-    members = sum(sizes)
-    every = max(LEAST_STEPS, len(scaled) // batch_size)
-    obs_dim, action_dim = scaled["observation"].shape[1], scaled["action"].shape[1]
-    with undisturbed():
-        torch.manual_seed(seed)
-        actors = [make_policy(obs_dim, action_dim) for _ in range(members)]
-        loss = TsallisBCLoss(actors, rating=PeakRating(beta=BETA)).to(device)
-        seeds = [1000 * seed + member for member in range(members)]
-        buffer = make_episode_buffer(scaled, seeds=seeds, batch_size=batch_size)
-        annealing = Annealing(start=max(1, updates // 12), length=max(1, 2 * updates // 3))
-        mixture = EpisodeMixture(loss, buffer, sizes, every=every, annealing=annealing, known=known, seed=seed)
-        if torch.device(device).type != "cpu":
-            buffer.append_transform(lambda batch: batch.to(device))
-        optimizer = AdaTerm(loss.parameters(), lr=LR, batch_dims=1)
-        steps = every * updates
-        trainer = make_offline_trainer(
-            loss, buffer, optimizer, steps=steps, tuner=ScoreTuner(loss), log_every=every, progress=progress
-        )
-        mixture.register(trainer)
-        trainer.train()
-    return mixture
+    numbers = {"components": (components, 2), "starts": (starts, 2), "updates": (updates, 1)}
+    for name, (value, low) in (numbers | {"batch_size": (batch_size, 1)}).items():
+        check_number(name, value, low=low, integer=True)
+    for seed in seeds:
+        check_number("seed", seed, low=0, integer=True)
+    check_number("threshold", threshold, above=0, high=1)
+    if not len(sets) or len(seeds) != len(sets):
+        raise ValueError(f"{len(sets)} sets and {len(seeds)} seeds: give one seed a set, and at least one")
+    scaled, counts = [], []
+    for data in sets:
+        episodes = find_episodes(data, purpose="a search for modes", open_end=True)
+        counts.append(len(episodes.starts))
+        if counts[-1] < 6:
+            raise ValueError(f"{counts[-1]} episodes are too few to find modes among them: record at least 6")
+        rows = data.select("observation", "action")
+        scaled.append(RobustScaling.fit(rows)(rows).set("episode", episodes.of_rows()))
+    components = min(components, min(counts) // 3)
+    sizes = [components if k % 2 == 0 else max(2, 2 * components // 3) for k in range(starts)]
+    mixture = train_mixtures(
+        scaled, sizes, seeds=seeds, updates=updates, batch_size=batch_size, device=device, progress=progress
+    )
+    out = []
+    of_sets = zip(mixture.responsibilities.split(sum(sizes)), mixture.known[::starts], strict=True)
+    for responsibilities, own in of_sets:
+        found = [part[:, own] for part in responsibilities.split(sizes)]
+        pairs = together(found)
+        groups = tuple(map(tuple, consensus(pairs, threshold)))
+        modes = Modes(groups, pairs, torch.stack([part.argmax(0) for part in found]))
+        if not (always or modes.agreement >= AGREE):
+            modes = replace(modes, groups=(tuple(range(int(own.sum()))),))
+        out.append(modes)
+    return out

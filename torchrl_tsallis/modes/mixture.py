@@ -39,7 +39,8 @@ class EpisodeMixture(TrainerHookBase):
         annealing (Annealing): of the temperature. Default: 0.5 to 20 over 40 updates, from the fifth on.
         known (Tensor): episodes that each mixture may learn from, ``[G, E]`` bool; others get responsibilities, and
             are never drawn. Default: all.
-        seed (int): of the soft starts; mixture g has seed + g. Default: 0.
+        seed (int | Sequence[int]): of the soft starts, one a mixture; of a single one, mixture g has seed + g.
+            Default: 0.
         steps_per_episode (int): rows of an episode that an update looks at, evenly spread. Default: 128.
 
     Attributes:
@@ -70,7 +71,7 @@ class EpisodeMixture(TrainerHookBase):
         every: int,
         annealing: Annealing | None = None,
         known: Tensor | None = None,
-        seed: int = 0,
+        seed: int | Sequence[int] = 0,
         steps_per_episode: int = 128,
     ) -> None:
         sampler = buffer.sampler
@@ -85,7 +86,9 @@ class EpisodeMixture(TrainerHookBase):
         self.loss, self.sampler, self.sizes = loss, sampler, list(sizes)
         self.every = int(check_number("every", every, low=1, integer=True))
         check_number("steps_per_episode", steps_per_episode, low=1, integer=True)
-        check_number("seed", seed, low=0, integer=True)
+        seeds = [seed + g for g in range(len(self.sizes))] if isinstance(seed, int) else list(seed)
+        for value in seeds:
+            check_number("seed", value, low=0, integer=True)
         self.annealing = annealing or Annealing()
         episodes = sampler.episodes
         count = len(episodes.starts)
@@ -97,11 +100,13 @@ class EpisodeMixture(TrainerHookBase):
         place = torch.arange(len(self._episode)) - (take.cumsum(0) - take)[self._episode]
         rows = episodes.starts[self._episode] + (place * episodes.lengths[self._episode]) // take[self._episode]
         self._rows: Any = buffer[rows]
-        parts = [
-            random_responsibilities(size, count, torch.Generator().manual_seed(seed + g))
-            for g, size in enumerate(self.sizes)
-        ]
-        self.responsibilities = torch.cat(parts)
+        self.responsibilities = torch.empty(members, count, dtype=torch.float64)
+        start = 0
+        for size, mine, value in zip(self.sizes, self.known, seeds, strict=True):
+            own = self.responsibilities[start : start + size]
+            own[:] = 1.0 / size
+            own[:, mine] = random_responsibilities(size, int(mine.sum()), torch.Generator().manual_seed(value))
+            start += size
         self.updates = self.steps = 0
         self._draw_by_them()
 
@@ -128,8 +133,8 @@ class EpisodeMixture(TrainerHookBase):
         assert number is not None
         parts = []
         members = len(self.responsibilities)
-        size = max(1, 2**15 // members)
         device = next(self.loss.parameters()).device
+        size = max(1, (2**15 if device.type == "cpu" else 2**20) // members)
         with evaluating(self.loss, self.loss.actor_network):
             for start in range(0, len(given), size):
                 part = given[start : start + size].to(device)
