@@ -18,25 +18,23 @@ The tables from the raw files alone::
 
 from __future__ import annotations
 
-import json
 from functools import partial
 from itertools import product
 from pathlib import Path
-from typing import Any
 
 import hydra
 from ant_common import check_names, demonstrations
 from ant_sweep import of_condition
 from ant_units import Key
 from common import as_list, keep_settings
-from modes_cell import evaluate, file_of, search
+from modes_cell import answer_of, evaluate, search
 from modes_report import read_rows, report, write_rows
 from omegaconf import DictConfig, OmegaConf
 
 from torchrl_tsallis.jobs import run_jobs
 
 #: Options that decide about a cell's result.
-SETTINGS = ("search", "smallest", "updates", "epochs", "batch_size", "data", "evaluation")
+SETTINGS = ("search", "threshold", "smallest", "updates", "epochs", "batch_size", "data", "evaluation")
 
 
 def wanted_of(cfg: DictConfig) -> list[Key]:
@@ -61,12 +59,9 @@ def run(cfg: DictConfig, keys: list[Key]) -> None:
     keep_settings(Path(cfg.output) / "settings.json", settings, SETTINGS)
     for key in dict.fromkeys(key._replace(task="", seed=0) for key in keys):  # recorded once, not by each worker
         demonstrations(of_condition(cfg, key), cfg.progress)
-    blocks: dict[tuple[Any, ...], list[Key]] = {}
-    for key in keys:
-        blocks.setdefault((*key._replace(seed=0), cfg.seeds.index(key.seed) // cfg.block), []).append(key)
+    jobs = [tuple(keys[k : k + cfg.block]) for k in range(0, len(keys), cfg.block)]
     bar = {"unit": "cell", "progress": cfg.progress, "workers": cfg.workers}
     try:
-        jobs = list(map(tuple, blocks.values()))
         run_jobs(partial(search, cfg=cfg), jobs, total=len(jobs), desc="finding modes", **bar)
         if cfg.mode == "run":
             run_jobs(partial(evaluate, cfg=cfg), keys, total=len(keys), desc="letting them walk", **bar)
@@ -86,10 +81,7 @@ def main(cfg: DictConfig) -> None:
     if cfg.mode == "find":
         return
     if cfg.mode == "run":
-        parts = {
-            key: [json.loads(file_of(key, name, cfg).read_text()) for name in ("found", "returns")] for key in keys
-        }
-        write_rows(results, {key: found | {"returns": returns} for key, (found, returns) in parts.items()})
+        write_rows(results, {key: answer_of(key, cfg) for key in keys})
     print(report(*read_rows(results), results, known=Path(cfg.known)))
     print(f"raw returns, assignments and tables in {results}")
 

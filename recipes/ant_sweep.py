@@ -59,9 +59,7 @@ def train(unit: Unit, cfg: DictConfig) -> None:
         torch.compiler.reset()  # code of an earlier unit in this process guards a loss that is no more
         loss.compile(**cfg.compile)
     members = [data[seed] for seed in seeds]
-    buffer = make_stacked_replay_buffer(members, seeds=seeds, batch_size=cfg.batch_size)
-    if torch.device(cfg.device).type != "cpu":
-        buffer.append_transform(lambda batch: batch.to(cfg.device))
+    buffer = make_stacked_replay_buffer(members, seeds=seeds, batch_size=cfg.batch_size, device=cfg.device)
     epoch = len(members[0]) // cfg.batch_size
     folder, (_, task, std, *_) = unit.folder, unit.condition
     logger = make_logger(cfg.log, folder, "log", group=f"std_{std:g}/{task}", tags=[task, folder.name])

@@ -18,7 +18,7 @@ from torchrl_tsallis.data.rows import take_rows
 from torchrl_tsallis.envs import make_ant
 from torchrl_tsallis.evaluation import evaluate_policies
 from torchrl_tsallis.jobs import atomic_path, tick
-from torchrl_tsallis.modes import find_modes_of_each
+from torchrl_tsallis.modes import Modes, find_modes_of_each
 from torchrl_tsallis.runs.members import Split, train_members
 from torchrl_tsallis.runs.policies import ScaledMeanPolicy
 from torchrl_tsallis.trainers import keep_freed_memory
@@ -45,19 +45,23 @@ def write(path: Path, answer: dict[str, Any]) -> None:
 
 
 def search(keys: tuple[Key, ...], cfg: DictConfig) -> None:
-    """Finds the modes of some seeds of a cell, in a process of its own."""
+    """Finds what the starts agree on in some cells, as one program, in a process of its own."""
     quiet()
-    keys = tuple(key for key in keys if not file_of(key, "found", cfg).exists())
+    keys = tuple(key for key in keys if not file_of(key, "starts", cfg).exists())
     sets = [data_of(key, cfg) for key in keys]
     options = {"updates": cfg.updates, "batch_size": cfg.batch_size, "device": cfg.device}
     each = find_modes_of_each(sets, seeds=[key.seed for key in keys], **cfg.search, **options) if keys else []
     for key, found, rows in zip(keys, each, sets, strict=True):
-        modes = found.of_episodes
-        answer = {"agreement": found.agreement, "recommended": found.recommended, "mode": modes.tolist()}
-        answer["membership"] = found.membership[modes, torch.arange(len(modes))].tolist()
-        answer["expert"] = rows["expert"][find_episodes(rows).starts].tolist()
-        write(file_of(key, "found", cfg), answer)
+        answer = {"pairs": found.pairs.tolist(), "starts": found.starts.tolist()}
+        write(file_of(key, "starts", cfg), answer | {"expert": rows["expert"][find_episodes(rows).starts].tolist()})
     tick()
+
+
+def found_in(key: Key, cfg: DictConfig) -> tuple[Modes, list[int]]:
+    """The modes of a cell, and the demonstrator of each episode."""
+    answer = json.loads(file_of(key, "starts", cfg).read_text())
+    pairs, starts = torch.tensor(answer["pairs"], dtype=torch.float64), torch.tensor(answer["starts"])
+    return Modes.of(pairs, starts, threshold=cfg.threshold), answer["expert"]
 
 
 def evaluate(key: Key, cfg: DictConfig) -> None:
@@ -65,12 +69,21 @@ def evaluate(key: Key, cfg: DictConfig) -> None:
     quiet()
     file = file_of(key, "returns", cfg)
     if not file.exists():
-        found = json.loads(file_of(key, "found", cfg).read_text())
-        rows, modes = data_of(key, cfg), torch.tensor(found["mode"])
-        numbers, counts = modes.unique(return_counts=True)
-        large = [int(k) for k, n in zip(numbers, counts, strict=True) if n >= cfg.smallest or k == found["recommended"]]
+        found, _ = found_in(key, cfg)
+        rows, modes = data_of(key, cfg), found.of_episodes
+        large = [k for k, group in enumerate(found.groups) if len(group) >= cfg.smallest or k == found.recommended]
         write(file, {str(k): evaluated(rows, modes[rows["episode"]] != k, key.seed, cfg) for k in large})
     tick()
+
+
+def answer_of(key: Key, cfg: DictConfig) -> dict[str, Any]:
+    """All that was found of a cell."""
+    found, expert = found_in(key, cfg)
+    modes = found.of_episodes
+    member = found.membership[modes, torch.arange(len(modes))]
+    answer = {"agreement": found.agreement, "recommended": found.recommended, "mode": modes.tolist()}
+    answer |= {"membership": member.tolist(), "expert": expert}
+    return answer | {"returns": json.loads(file_of(key, "returns", cfg).read_text())}
 
 
 def data_of(key: Key, cfg: DictConfig) -> Any:

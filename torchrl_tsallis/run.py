@@ -15,6 +15,7 @@ from tensordict import TensorDictBase
 from torchrl.record.loggers.common import Logger
 
 from torchrl_tsallis._checks import check_number, shown
+from torchrl_tsallis._device import check_device
 from torchrl_tsallis.data.hygiene import inspect_demonstrations
 from torchrl_tsallis.data.signals import episode_signals
 from torchrl_tsallis.jobs.files import atomic_path
@@ -22,7 +23,7 @@ from torchrl_tsallis.runs.card import model_card
 from torchrl_tsallis.runs.folder import check_free, new_folder, write_json
 from torchrl_tsallis.runs.held_out import hold_out
 from torchrl_tsallis.runs.judgement import judge
-from torchrl_tsallis.runs.members import LR, Members, Split, check_device, make_splits, train_members
+from torchrl_tsallis.runs.members import LR, Members, Split, make_splits, train_members
 from torchrl_tsallis.runs.modes import mode_source, modes
 from torchrl_tsallis.runs.opened import Run
 from torchrl_tsallis.runs.saved import save_run

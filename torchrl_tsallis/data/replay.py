@@ -23,6 +23,7 @@ def make_replay_buffer(
     keys: Sequence[NestedKey] = ("observation", "action"),
     scratch_dir: str | os.PathLike[str] | None = None,
     dtype: torch.dtype | None = None,
+    device: str | torch.device | None = None,
 ) -> TensorDictReplayBuffer:
     """Puts demonstrations into a memory-mapped buffer that is sampled epoch by epoch.
 
@@ -38,6 +39,7 @@ def make_replay_buffer(
             memory.
         dtype: of the floating-point numbers in batches, such as torch.float32 for NumPy's float64. Default: as stored;
             the offline trainer gives a float32 loss float32, with a logged notice.
+        device: that the rows are copied to, such as a GPU, and batches come from. Default: rows stay on disk.
 
     Returns:
         The buffer. It cannot be written to.
@@ -57,7 +59,7 @@ def make_replay_buffer(
     check_batch_size(batch_size=batch_size)
     seed, keys = check_seed("seed", seed), check_keys("keys", keys)
     check_rows(demonstrations, keys, least=batch_size)
-    storage = make_storage([demonstrations.select(*keys)], scratch_dir, dtype=dtype)
+    storage = make_storage([demonstrations.select(*keys)], scratch_dir, dtype=dtype, device=device)
     buffer = make_buffer(storage, SamplerWithoutReplacement(drop_last=True), batch_size)
     buffer.set_rng(torch.Generator().manual_seed(seed))
     return buffer

@@ -13,6 +13,7 @@ from torch import Tensor
 from torchrl.data import ImmutableDatasetWriter, SliceSamplerWithoutReplacement, TensorDictReplayBuffer
 
 from torchrl_tsallis._checks import check_keys, check_seed
+from torchrl_tsallis._device import check_device
 from torchrl_tsallis.data.episodes import ENDS, IS_INIT, Episodes, find_episodes, read_flag
 from torchrl_tsallis.data.schema import check_layout, check_rows
 from torchrl_tsallis.data.storage import check_batch_size, make_storage
@@ -51,6 +52,7 @@ def make_sequence_buffer(
     keys: Sequence[NestedKey] = _KEYS,
     scratch_dir: str | os.PathLike[str] | None = None,
     dtype: torch.dtype | None = None,
+    device: str | torch.device | None = None,
 ) -> SequenceReplayBuffer:
     """Puts trajectories into a memory-mapped buffer that gives slices of them, ``[num_slices, slice_len]``.
 
@@ -70,6 +72,7 @@ def make_sequence_buffer(
             memory.
         dtype: of the floating-point numbers in batches, such as torch.float32 for NumPy's float64. Default: as stored;
             the offline trainer gives a float32 loss float32, with a logged notice.
+        device: of the batches, such as a GPU. Default: memory.
 
     Returns:
         The buffer; ``sample()`` gives ``[B, T]``. It cannot be written to. Flags are ``[B, T, 1]``, and ``done`` is
@@ -113,6 +116,8 @@ def make_sequence_buffer(
         slice_len=slice_len,
     )
     buffer.set_rng(torch.Generator().manual_seed(seed))
+    if device is not None and check_device(device).type != "cpu":
+        buffer.append_transform(lambda batch: batch.to(device))
     return buffer
 
 

@@ -134,6 +134,7 @@ def make_stacked_replay_buffer(
     keys: Sequence[NestedKey] = ("observation", "action"),
     scratch_dir: str | os.PathLike[str] | None = None,
     dtype: torch.dtype | None = None,
+    device: str | torch.device | None = None,
 ) -> TensorDictReplayBuffer:
     """Puts the demonstrations of S members into one memory-mapped buffer; ``sample()`` gives ``[S, batch_size]``.
 
@@ -149,6 +150,7 @@ def make_stacked_replay_buffer(
             memory.
         dtype: of the floating-point numbers in batches, such as torch.float32 for NumPy's float64. Default: as stored;
             the offline trainer gives a float32 loss float32, with a logged notice.
+        device: that the rows are copied to, such as a GPU, and batches come from. Default: rows stay on disk.
 
     Returns:
         The buffer. It cannot be written to.
@@ -183,5 +185,5 @@ def make_stacked_replay_buffer(
         start += len(member)
     sampler = MemberSampler(seeds, [rows[id(member)] for member in members])
     together = [member.select(*keys) for member in unique.values()]
-    storage = make_storage(together, scratch_dir, dtype=dtype)
+    storage = make_storage(together, scratch_dir, dtype=dtype, device=device)
     return make_buffer(storage, sampler, batch_size)

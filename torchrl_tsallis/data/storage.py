@@ -16,6 +16,7 @@ from torchrl.data import ImmutableDatasetWriter, TensorDictReplayBuffer, TensorS
 from torchrl.data.replay_buffers.samplers import Sampler
 
 from torchrl_tsallis._checks import check_path, shown
+from torchrl_tsallis._device import check_device
 from torchrl_tsallis.data.rows import is_memory_mapped, store_rows
 
 _log = logging.getLogger(__name__)
@@ -46,16 +47,26 @@ class RowStorage(TensorStorage):
     Args:
         rows: the demonstrations, ``[N]``.
         dtype: of the floating-point numbers that are read. Default: as stored.
+        device: to copy the rows to, such as a GPU. Default: as they are; those on disk stay there.
     """
 
     _storage: Any
 
-    def __init__(self, rows: TensorDictBase, *, dtype: torch.dtype | None = None) -> None:
-        super().__init__(rows)
-        self.dtype = dtype
+    def __init__(
+        self,
+        rows: TensorDictBase,
+        *,
+        dtype: torch.dtype | None = None,
+        device: str | torch.device | None = None,
+    ) -> None:
+        elsewhere = None if device is None or check_device(device).type == "cpu" else torch.device(device)
+        super().__init__(rows if elsewhere is None else as_dtype(rows, dtype).to(elsewhere))
+        self.dtype, self._elsewhere = dtype, elsewhere
 
     def get(self, index: Any) -> Any:
         """Rows ``[B]`` or ``[S, B]``; the latter one by one in a row: general indexing takes several times as long."""
+        if self._elsewhere is not None and isinstance(index, torch.Tensor):
+            index = index.to(self._elsewhere)
         if isinstance(index, torch.Tensor) and index.ndim == 2:
             flat, shape = index.flatten(), index.shape
             out = self._storage.apply(lambda x: x.index_select(0, flat).unflatten(0, shape), batch_size=shape)
@@ -79,7 +90,11 @@ def check_batch_size(**sizes: Any) -> None:
 
 
 def make_storage(
-    parts: Sequence[TensorDictBase], scratch_dir: str | os.PathLike[str] | None, *, dtype: torch.dtype | None
+    parts: Sequence[TensorDictBase],
+    scratch_dir: str | os.PathLike[str] | None,
+    *,
+    dtype: torch.dtype | None,
+    device: str | torch.device | None = None,
 ) -> RowStorage:
     """Stores rows, one part after the other; memory-mapped rows stay where they are.
 
@@ -87,6 +102,7 @@ def make_storage(
         parts: tensordicts ``[N_k]`` of what to store, and nothing else.
         scratch_dir: folder of the memory map where one is written.
         dtype: of the floating-point numbers in batches. Default: as in the parts.
+        device: that the rows are copied to. Default: none.
 
     Returns:
         The storage, ``[sum N_k]``.
@@ -107,8 +123,9 @@ def make_storage(
                     "members of one buffer need the same entries, shapes and dtypes"
                 )
     if len(parts) == 1 and is_memory_mapped(parts[0]):
-        return RowStorage(parts[0], dtype=dtype)
-    return RowStorage(store_rows(parts, scratch_dir=scratch_dir, convert=lambda rows: as_dtype(rows, dtype)))
+        return RowStorage(parts[0], dtype=dtype, device=device)
+    rows = store_rows(parts, scratch_dir=scratch_dir, convert=lambda rows: as_dtype(rows, dtype))
+    return RowStorage(rows, device=device)
 
 
 def make_buffer(storage: RowStorage, sampler: Sampler, batch_size: int) -> TensorDictReplayBuffer:

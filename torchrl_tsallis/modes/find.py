@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Any
 
 import torch
@@ -12,15 +11,12 @@ from tensordict import TensorDictBase
 from torchrl_tsallis._checks import check_number
 from torchrl_tsallis.data.episodes import find_episodes
 from torchrl_tsallis.data.robust_scaling import RobustScaling
-from torchrl_tsallis.modes.consensus import consensus, together
-from torchrl_tsallis.modes.found import Modes
+from torchrl_tsallis.modes.consensus import together
+from torchrl_tsallis.modes.found import TOGETHER, Modes
 from torchrl_tsallis.modes.train import train_mixtures
 
 #: Updates of the responsibilities.
 UPDATES = 60
-#: Least share of starts in which the episodes of a mode are together, and least agreement between starts (of which 0 is
-#: chance) for more than one mode; measured, see docs/modes.md.
-TOGETHER, AGREE = 0.4, 0.2
 
 
 def find_modes(
@@ -138,9 +134,6 @@ def find_modes_of_each(
     for responsibilities, own in of_sets:
         found = [part[:, own] for part in responsibilities.split(sizes)]
         pairs = together(found)
-        groups = tuple(map(tuple, consensus(pairs, threshold)))
-        modes = Modes(groups, pairs, torch.stack([part.argmax(0) for part in found]))
-        if not (always or modes.agreement >= AGREE):
-            modes = replace(modes, groups=(tuple(range(int(own.sum()))),))
-        out.append(modes)
+        starts_of = torch.stack([part.argmax(0) for part in found])
+        out.append(Modes.of(pairs, starts_of, threshold=threshold, always=always))
     return out

@@ -7,7 +7,11 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchrl_tsallis.modes.consensus import adjusted_rand_index
+from torchrl_tsallis.modes.consensus import adjusted_rand_index, consensus
+
+#: Least share of starts in which the episodes of a mode are together, and least agreement between starts (of which 0 is
+#: chance) for more than one mode; measured, see docs/modes.md.
+TOGETHER, AGREE = 0.5, 0.2
 
 
 @dataclass(frozen=True)
@@ -23,6 +27,19 @@ class Modes:
     groups: tuple[tuple[int, ...], ...]
     pairs: Tensor
     starts: Tensor
+
+    @classmethod
+    def of(cls, pairs: Tensor, starts: Tensor, *, threshold: float = TOGETHER, always: bool = False) -> Modes:
+        """The modes that starts agree on, or one where they agree by no more than chance would let them.
+
+        Args:
+            pairs: how often two episodes were of one component, ``[E, E]``.
+            starts: component of each episode in each start, ``[K, E]``.
+            threshold: least share of starts in which the episodes of a mode are together.
+            always: whether modes are what the starts agree on, however little that is.
+        """
+        found = cls(tuple(map(tuple, consensus(pairs, threshold))), pairs, starts)
+        return found if always or found.agreement >= AGREE else cls((tuple(range(len(pairs))),), pairs, starts)
 
     @property
     def agreement(self) -> float:

@@ -116,6 +116,7 @@ def make_episode_buffer(
     keys: Sequence[NestedKey] = ("observation", "action"),
     scratch_dir: str | os.PathLike[str] | None = None,
     dtype: torch.dtype | None = None,
+    device: str | torch.device | None = None,
 ) -> TensorDictReplayBuffer:
     """Puts demonstrations into a buffer from which each member draws episodes by its own weights, ``[S, batch_size]``.
 
@@ -126,6 +127,7 @@ def make_episode_buffer(
         keys: the entries to store.
         scratch_dir: folder of the memory map. Default: shared memory.
         dtype: of the floating-point numbers in batches. Default: as stored.
+        device: that the rows are copied to, such as a GPU, and batches come from. Default: rows stay on disk.
 
     Returns:
         The buffer; ``sampler.weights`` may be changed between samples. It cannot be written to.
@@ -145,5 +147,5 @@ def make_episode_buffer(
     check_layout(demonstrations)
     check_rows(demonstrations, keys)
     episodes = find_episodes(demonstrations, purpose="a mixture of whole episodes")
-    storage = make_storage([demonstrations.select(*keys)], scratch_dir, dtype=dtype)
+    storage = make_storage([demonstrations.select(*keys)], scratch_dir, dtype=dtype, device=device)
     return make_buffer(storage, EpisodeSampler(episodes, seeds), batch_size)

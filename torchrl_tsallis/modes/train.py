@@ -65,14 +65,12 @@ def train_mixtures(
             actors += [make_policy(obs_dim, action_dim) for _ in range(of_a_set)]
         loss = TsallisBCLoss(actors, rating=PeakRating(beta=BETA)).to(device)
         of_samples = [1000 * seed + member for seed in seeds for member in range(of_a_set)]
-        buffer = make_episode_buffer(rows, seeds=of_samples, batch_size=batch_size)
+        buffer = make_episode_buffer(rows, seeds=of_samples, batch_size=batch_size, device=device)
         annealing = Annealing(start=max(1, updates // 12), length=max(1, 2 * updates // 3))
         soft = [seed + g for seed in seeds for g in range(len(sizes))]
         mixture = EpisodeMixture(
             loss, buffer, list(sizes) * count, every=every, annealing=annealing, known=known, seed=soft
         )
-        if torch.device(device).type != "cpu":
-            buffer.append_transform(lambda batch: batch.to(device))
         optimizer = AdaTerm(loss.parameters(), lr=LR, batch_dims=1)
         steps = every * updates
         trainer = make_offline_trainer(

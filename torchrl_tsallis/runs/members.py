@@ -42,24 +42,6 @@ class Split:
     held_out: Tensor
 
 
-def check_device(device: str | torch.device) -> torch.device:
-    """The device, once a tensor could be put there.
-
-    Raises:
-        ValueError: if there is no such device here.
-
-    Examples:
-        >>> check_device("cpu")
-        device(type='cpu')
-    """
-    try:
-        found = torch.device(device)
-        torch.zeros(1, device=found).cpu()
-    except (RuntimeError, AssertionError, NotImplementedError, TypeError) as error:
-        raise ValueError(f"device={device!r} is not there, or torch was installed without it: take 'cpu'") from error
-    return found
-
-
 def make_splits(data: TensorDictBase, *, seeds: int, folds: int) -> list[Split]:
     """Deals the episodes into folds anew for each seed, so that seeds differ in all that chance decides.
 
@@ -172,10 +154,8 @@ def train_members(
             torch.manual_seed(seed)
             actors.append(make_policy(rows["observation"].shape[1], rows["action"].shape[1]))
         loss = TsallisBCLoss(actors, rating=PeakRating(beta=BETA)).to(device)
-        buffer = make_stacked_replay_buffer(parts, seeds=seeds, batch_size=batch_size)
+        buffer = make_stacked_replay_buffer(parts, seeds=seeds, batch_size=batch_size, device=device)
         del parts
-        if torch.device(device).type != "cpu":
-            buffer.append_transform(lambda batch: batch.to(device))
         trainer = make_offline_trainer(
             loss,
             buffer,

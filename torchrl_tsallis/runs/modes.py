@@ -11,13 +11,13 @@ import torch
 from tensordict import TensorDictBase
 
 from torchrl_tsallis._checks import check_number
+from torchrl_tsallis._device import check_device
 from torchrl_tsallis.data.modes_folder import KIND, ModesFolder
 from torchrl_tsallis.data.rows import take_rows
-from torchrl_tsallis.modes.find import AGREE, UPDATES, find_modes
-from torchrl_tsallis.modes.found import Modes
+from torchrl_tsallis.modes.find import UPDATES, find_modes
+from torchrl_tsallis.modes.found import AGREE, Modes
 from torchrl_tsallis.modes.train import BETA, LR
 from torchrl_tsallis.runs.folder import FORMAT, RUN, check_free, new_folder, write_csv, write_json
-from torchrl_tsallis.runs.members import check_device
 from torchrl_tsallis.runs.saved import save_tensors, versions
 from torchrl_tsallis.runs.source import Source, identity, load_source
 

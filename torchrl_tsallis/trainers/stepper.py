@@ -83,6 +83,8 @@ class GuardedStepper(OptimizationStepper):
         total = sum(value for key, value in losses.items() if key.startswith("loss"))
         total.backward()
         out = losses.detach()
+        if getattr(trainer.loss_module, "_compiled_call_impl", None) is not None:
+            out = out.clone()  # a program of CUDA graphs writes the next step's losses over these
         params = [p for group in optimizer.param_groups for p in group["params"]]
         norm, good = guard_grads(params, out.get("member_loss", total.detach()), trainer.clip_norm)
         any_good = bool(good.any())
