@@ -6,9 +6,9 @@ killed and started again; what is done is not done twice::
     python recipes/ant_modes.py
     python recipes/ant_modes.py part=[gaits] seeds=[200,201]
 
-On a GPU the search of several seeds is one program; the policies, which are small, may be trained elsewhere::
+On a GPU many cells are one program; the policies may walk elsewhere, where the same folder is::
 
-    python recipes/ant_modes.py mode=find device=cuda block=5 workers=4
+    python recipes/ant_modes.py mode=train device=cuda block=15 workers=6
     python recipes/ant_modes.py
 
 The tables from the raw files alone::
@@ -27,14 +27,14 @@ from ant_common import check_names, demonstrations
 from ant_sweep import of_condition
 from ant_units import Key
 from common import as_list, keep_settings
-from modes_cell import answer_of, evaluate, search
+from modes_cell import answer_of, evaluate, search, train
 from modes_report import read_rows, report, write_rows
 from omegaconf import DictConfig, OmegaConf
 
 from torchrl_tsallis.jobs import run_jobs
 
 #: Options that decide about a cell's result.
-SETTINGS = ("search", "threshold", "smallest", "updates", "epochs", "batch_size", "data", "evaluation")
+SETTINGS = ("search", "threshold", "smallest", "updates", "steps", "batch_size", "data", "evaluation")
 
 
 def wanted_of(cfg: DictConfig) -> list[Key]:
@@ -63,6 +63,7 @@ def run(cfg: DictConfig, keys: list[Key]) -> None:
     bar = {"unit": "cell", "progress": cfg.progress, "workers": cfg.workers}
     try:
         run_jobs(partial(search, cfg=cfg), jobs, total=len(jobs), desc="finding modes", **bar)
+        run_jobs(partial(train, cfg=cfg), jobs, total=len(jobs), desc="training policies", **bar)
         if cfg.mode == "run":
             run_jobs(partial(evaluate, cfg=cfg), keys, total=len(keys), desc="letting them walk", **bar)
     except KeyboardInterrupt:
@@ -73,12 +74,12 @@ def run(cfg: DictConfig, keys: list[Key]) -> None:
 def main(cfg: DictConfig) -> None:
     """Runs and shows, or only shows."""
     results = Path(cfg.results)
-    if cfg.mode not in ("run", "find", "report"):
-        raise SystemExit(f"no mode {cfg.mode!r}: choose run, find or report")
+    if cfg.mode not in ("run", "train", "report"):
+        raise SystemExit(f"no mode {cfg.mode!r}: choose run, train or report")
     if cfg.mode != "report":
         keys = wanted_of(cfg)
         run(cfg, keys)
-    if cfg.mode == "find":
+    if cfg.mode == "train":
         return
     if cfg.mode == "run":
         write_rows(results, {key: answer_of(key, cfg) for key in keys})

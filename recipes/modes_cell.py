@@ -14,13 +14,14 @@ from omegaconf import DictConfig
 from torchrl import torchrl_logger
 
 from torchrl_tsallis.data import find_episodes
-from torchrl_tsallis.data.rows import take_rows
+from torchrl_tsallis.data.robust_scaling import RobustScaling
 from torchrl_tsallis.envs import make_ant
 from torchrl_tsallis.evaluation import evaluate_policies
 from torchrl_tsallis.jobs import atomic_path, tick
 from torchrl_tsallis.modes import Modes, find_modes_of_each
 from torchrl_tsallis.runs.members import Split, train_members
 from torchrl_tsallis.runs.policies import ScaledMeanPolicy
+from torchrl_tsallis.runs.saved import load_tensors, save_tensors
 from torchrl_tsallis.trainers import keep_freed_memory
 
 
@@ -64,15 +65,53 @@ def found_in(key: Key, cfg: DictConfig) -> tuple[Modes, list[int]]:
     return Modes.of(pairs, starts, threshold=cfg.threshold), answer["expert"]
 
 
+def train(keys: tuple[Key, ...], cfg: DictConfig) -> None:
+    """Trains a policy of each large mode of some cells, as one program, in a process of its own."""
+    quiet()
+    keys = tuple(key for key in keys if not file_of(key, "policies", cfg, "safetensors").exists())
+    sets = [data_of(key, cfg) for key in keys]
+    total, start = sum(map(len, sets)), 0
+    splits, owners = [], []
+    for key, rows in zip(keys, sets, strict=True):
+        found, _ = found_in(key, cfg)
+        for k, group in enumerate(found.groups):
+            if len(group) >= cfg.smallest or k == found.recommended:
+                held_out = torch.ones(total, dtype=torch.bool)
+                held_out[start : start + len(rows)] = found.of_episodes[rows["episode"]] != k
+                splits.append(Split(key.seed, held_out))
+                owners.append((key, k))
+        start += len(rows)
+    if keys:
+        together = torch.cat([rows.select("observation", "action") for rows in sets])
+        members = train_members(together, splits, steps=cfg.steps, batch_size=cfg.batch_size, device=cfg.device)
+        state: dict[Key, dict[str, torch.Tensor]] = {key: {} for key in keys}
+        for member, (key, k) in enumerate(owners):
+            parts = {"actor": members.actor_state(member), "scaling": members.scalings[member].state_dict()}
+            for part, values in parts.items():
+                state[key] |= {f"{k}:{part}:{name}": value for name, value in values.items()}
+        for key in keys:
+            save_tensors(file_of(key, "policies", cfg, "safetensors"), state[key])
+    tick()
+
+
 def evaluate(key: Key, cfg: DictConfig) -> None:
-    """Trains a policy of each mode that was found, and lets it walk, in a process of its own."""
+    """Lets the policies of a cell's modes walk, in a process of its own."""
     quiet()
     file = file_of(key, "returns", cfg)
     if not file.exists():
-        found, _ = found_in(key, cfg)
-        rows, modes = data_of(key, cfg), found.of_episodes
-        large = [k for k, group in enumerate(found.groups) if len(group) >= cfg.smallest or k == found.recommended]
-        write(file, {str(k): evaluated(rows, modes[rows["episode"]] != k, key.seed, cfg) for k in large})
+        state: dict[str, dict[str, dict[str, torch.Tensor]]] = {}
+        for name, value in load_tensors(file_of(key, "policies", cfg, "safetensors")).items():
+            mode, part, rest = name.split(":")
+            state.setdefault(mode, {}).setdefault(part, {})[rest] = value
+        policies = {
+            mode: ScaledMeanPolicy.of(own["actor"], RobustScaling.from_state_dict(own["scaling"]))
+            for mode, own in state.items()
+        }
+        options = {"episodes": cfg.evaluation.episodes, "seed": cfg.evaluation.seed, "workers": 0, "progress": False}
+        returns: dict[str, list[float]] = {mode: [] for mode in policies}
+        for row in evaluate_policies(policies, env_fn=make_ant, **options):
+            returns[row["policy"]].append(row["return"])
+        write(file, returns)
     tick()
 
 
@@ -93,18 +132,7 @@ def data_of(key: Key, cfg: DictConfig) -> Any:
     return rows.set("expert", labels_of(data, len(cfg.trios[key.trio]) - 1))
 
 
-def evaluated(rows: Any, left_out: torch.Tensor, seed: int, cfg: DictConfig) -> list[float]:
-    """Returns of the policy that is trained on the other rows, for as many passes over them as those of a recipe."""
-    kept = take_rows(rows, ~left_out)
-    steps = cfg.epochs * max(1, len(kept) // cfg.batch_size)
-    split = Split(seed, torch.zeros(len(kept), dtype=torch.bool))
-    members = train_members(kept, [split], steps=steps, batch_size=cfg.batch_size, device=cfg.device)
-    policy = ScaledMeanPolicy.of(members.actor_state(0), members.scalings[0])
-    options = {"episodes": cfg.evaluation.episodes, "seed": cfg.evaluation.seed, "workers": 0, "progress": False}
-    return [row["return"] for row in evaluate_policies({"mode": policy}, env_fn=make_ant, **options)]
-
-
-def file_of(key: Key, what: str, cfg: DictConfig) -> Path:
+def file_of(key: Key, what: str, cfg: DictConfig, ending: str = "json") -> Path:
     """Where what was found of a cell, or the returns, are kept."""
     folder = Path(cfg.output).absolute() / "cells" / key.trio / f"std_{key.std:g}" / key.task
-    return folder / f"{what}_{key.seed}.json"
+    return folder / f"{what}_{key.seed}.{ending}"
