@@ -8,7 +8,7 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from tensordict import TensorDictBase
@@ -23,7 +23,7 @@ from torchrl_tsallis.runs.card import model_card
 from torchrl_tsallis.runs.folder import check_free, new_folder, write_json
 from torchrl_tsallis.runs.held_out import hold_out
 from torchrl_tsallis.runs.judgement import judge
-from torchrl_tsallis.runs.members import LR, Members, Split, make_splits, train_members
+from torchrl_tsallis.runs.members import LR, Members, Split, default_steps, make_splits, train_members
 from torchrl_tsallis.runs.modes import mode_source, modes
 from torchrl_tsallis.runs.opened import Run
 from torchrl_tsallis.runs.saved import save_run
@@ -31,22 +31,6 @@ from torchrl_tsallis.runs.source import Source, load_source
 from torchrl_tsallis.runs.tables import write_tables
 
 __all__ = ["Run", "default_steps", "modes", "rate", "train"]
-
-#: Passes over the data, and bounds of the steps that they give.
-EPOCHS, LEAST_STEPS, MOST_STEPS = 40, 1000, 10_000
-
-
-def default_steps(rows: int, batch_size: int = 256) -> int:
-    """Gradient steps for so much data: 40 passes, from 1000 to 10,000 steps, in hundreds.
-
-    More passes fit the training episodes better and other episodes worse: on 25 episodes of a person, the squared
-    errors on held-out episodes were 1.7 and 2.6 times what the policies expected after 300 and 1000 steps.
-
-    Examples:
-        >>> default_steps(30_000), default_steps(500), default_steps(10**6)
-        (4700, 1000, 10000)
-    """
-    return min(MOST_STEPS, max(LEAST_STEPS, round(EPOCHS * rows / batch_size / 100) * 100))
 
 
 def rate(
@@ -160,7 +144,7 @@ def train(
     episode: str | None = None,
     format: str | None = None,
     filter_key: str | None = None,
-    mode: int | None = None,
+    mode: int | Literal["each"] | None = None,
     steps: int | None = None,
     seed: int = 0,
     batch_size: int = 256,
@@ -181,7 +165,8 @@ def train(
         episode: key of the episode's number (npz, CSV).
         format: name of the format.
         filter_key: subset of the file's episodes.
-        mode: of the folder ``path_or_data`` that :func:`modes` left, whose episodes alone are imitated.
+        mode: of the folder ``path_or_data`` that :func:`modes` left, whose episodes alone are imitated; ``each`` for
+            one policy of all episodes whose observation goes on with the mode, as a 1 among zeros.
         steps: gradient steps. Default: :func:`default_steps`.
         seed: of the first parameters and of the samples' order.
         batch_size: samples a step.

@@ -1,4 +1,4 @@
-"""The picture of modes."""
+"""The page of modes, and its drawings."""
 
 from __future__ import annotations
 
@@ -10,7 +10,8 @@ from tensordict import TensorDict
 pytest.importorskip("matplotlib")
 
 from torchrl_tsallis.report.figures import new_figure
-from torchrl_tsallis.report.modes import COLOURS, colour_of, draw_modes, draw_together, write_modes_picture
+from torchrl_tsallis.report.modes import COLOURS, colour_of, draw_differences, draw_modes, draw_together
+from torchrl_tsallis.report.modes_page import most_different, write_modes_report
 from torchrl_tsallis.report.svg import MUTED
 from torchrl_tsallis.run import modes
 
@@ -38,9 +39,50 @@ def test_colours_end_in_grey():
     assert colour_of(len(COLOURS), 9) == MUTED and len(set(COLOURS)) == len(COLOURS)
 
 
-def test_a_picture_is_written_beside_the_modes(tmp_path):
+def test_a_map_of_differences_has_time_from_left_to_right_and_a_row_a_dimension():
+    figure, (axes,) = new_figure(4, 3)
+    draw_differences(axes, np.array([[0.0, 1.0], [2.0, 3.0], [4.0, 5.0]]), ("#000000", "#ffffff"))
+    assert axes.images[0].get_array().tolist() == [[0.0, 2.0, 4.0], [1.0, 3.0, 5.0]]
+    assert most_different(np.array([[0.0, 1.0], [2.0, 3.0]])).startswith(
+        "most in dimension 1 of the action, from 50 to"
+    )
+
+
+def searched(folder, **options):
     rows = {"observation": torch.rand(80, 2), "action": torch.rand(80, 1), "episode": torch.arange(80) // 10}
-    modes(TensorDict(rows, [80]), tmp_path / "modes", updates=2, components=2, progress=False)
-    place = write_modes_picture(tmp_path / "modes")
-    assert place.read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
-    modes(TensorDict(rows, [80]), tmp_path / "modes", updates=2, progress=False, overwrite=True)
+    data = TensorDict({**rows, "operator": rows["episode"] % 2}, [80])
+    return modes(data, folder, updates=2, progress=False, overwrite=True, **options)
+
+
+def test_the_page_says_what_was_found_loads_nothing_and_is_written_beside_a_picture(tmp_path):
+    found = searched(tmp_path / "modes", components=2, labels="operator")
+    page = write_modes_report(tmp_path / "modes")
+    text = page.read_text()
+    assert (tmp_path / "modes" / "modes.png").read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
+    large = [mode for mode in found.summary["modes"] if mode["episodes"] > 1]
+    assert f"<h1>{len(large)} modes of behaviour" in text and found.summary["sentence"] in text
+    assert "(imitate)" in text and "Your labels" in text and "<code>operator</code>" in text
+    for part in ("http:", "https:", "src=", "<script", '<link rel="stylesheet'):
+        assert part not in text
+    assert text.count("<svg") == 2 + (len(large) * (len(large) - 1) // 2 if len(large) < 4 else 3)
+
+
+def test_the_page_of_one_mode_compares_nothing(tmp_path):
+    searched(tmp_path / "modes")
+    text = write_modes_report(tmp_path / "modes").read_text()
+    assert "<h1>One mode of behaviour</h1>" in text
+    assert "How they differ" not in text and "Your labels" not in text and "(imitate)" not in text
+
+
+def test_names_from_the_data_are_escaped(tmp_path):
+    searched(tmp_path / "modes", components=2)
+    table = tmp_path / "modes" / "modes.csv"
+    table.write_text(table.read_text().replace("0,0,", "0,<b>x</b>,", 1))
+    assert "<b>x</b>" not in write_modes_report(tmp_path / "modes").read_text()
+
+
+def test_a_broken_table_of_differences_is_named(tmp_path):
+    searched(tmp_path / "modes", components=2)
+    (tmp_path / "modes" / "differences.csv").write_text("mode,other\n0,1\n")
+    with pytest.raises(ValueError, match="differences.csv' is broken"):
+        write_modes_report(tmp_path / "modes")

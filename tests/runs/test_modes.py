@@ -81,6 +81,71 @@ def test_what_cannot_be_done_is_said(file, folder, tmp_path):
     assert not list(tmp_path.iterdir())
 
 
+def test_one_policy_of_all_episodes_does_what_the_mode_says(folder, tmp_path):
+    found = ModesFolder.open(folder)
+    large = [mode["mode"] for mode in found.summary["modes"] if mode["episodes"] > 1]
+    run = train(folder, tmp_path / "policy", mode="each", steps=600, batch_size=64, progress=False)
+    assert run.settings["data"]["mode"] == "each" and run.settings["data"]["episodes"] == 12
+    assert run.settings["data"]["layout"][-1] == ["mode", 2, 2 + len(large)]
+    for place, mode in enumerate(large[:2]):
+        told = np.eye(len(large), dtype=np.float32)[place]
+        sign = 1 if int(found.episodes_of(mode)[0]) % 2 else -1
+        action = Run.open(tmp_path / "policy").numpy_policy()(np.concatenate([[1.0, -0.5], told]).astype(np.float32))
+        assert action == pytest.approx([sign, -0.5 * sign], abs=0.3)
+
+
+def test_modes_differ_where_their_operators_do(folder):
+    rows = np.genfromtxt(folder / "differences.csv", delimiter=",", names=True)
+    found = ModesFolder.open(folder)
+    odd = {mode["mode"]: int(found.episodes_of(mode["mode"])[0]) % 2 for mode in found.summary["modes"]}
+    assert len(rows) % 20 == 0 and len(rows)
+    for pair in {(int(row["mode"]), int(row["other"])) for row in rows}:
+        values = [row["difference"] for row in rows if (row["mode"], row["other"]) == pair]
+        # Actions are plus and minus standard normal numbers: |2 x| is 2 sqrt(2 / pi) = 1.6 on average.
+        assert len(values) == 20 and (np.mean(values) > 1.0) == (odd[pair[0]] != odd[pair[1]])
+
+
+LABELLED = {
+    "npz": lambda path, who: np.savez(path, **arrays(), operator=np.repeat(who, 40)),
+    "csv": lambda path, who: path.write_text(
+        "episode,obs,act,operator\n" + "".join(f"{k // 10},{k},{k % 7},{who[k // 10]}\n" for k in range(120))
+    ),
+}
+
+
+def arrays():
+    rng = np.random.default_rng(0)
+    return {
+        "observations": rng.normal(size=(480, 2)),
+        "actions": rng.normal(size=(480, 2)),
+        "terminals": np.arange(480) % 40 == 39,
+    }
+
+
+@pytest.mark.parametrize("ending", LABELLED)
+def test_labels_of_the_user_are_compared_and_not_used(tmp_path, ending):
+    path, who = tmp_path / f"data.{ending}", np.array(["anna", "ben"] * 6)
+    LABELLED[ending](path, who)
+    options = {"updates": 1, "components": 2, "progress": False}
+    with_labels = modes(path, tmp_path / "with", labels="operator", **options)
+    without = modes(path, tmp_path / "without", **options)
+    assert (with_labels.mode == without.mode).all() and "labels" not in without.summary
+    found = with_labels.summary["labels"]
+    assert found["key"] == "operator" and {sum(n.values()) for n in found["episodes"].values()} == {6}
+    lines = (tmp_path / "with" / "labels.csv").read_text().splitlines()
+    assert lines[0] == "episode,source,label" and [line.rpartition(",")[2] for line in lines[1:]] == who.tolist()
+
+
+def test_labels_that_are_none_are_refused_before_the_search(tmp_path):
+    path = tmp_path / "data.npz"
+    np.savez(path, **arrays(), operator=np.arange(480))
+    with pytest.raises(KeyError, match="has no 'who', only"):
+        modes(path, tmp_path / "out", labels="who", progress=False)
+    with pytest.raises(ValueError, match="'operator' of .* within episode '0': a label says one thing of an episode"):
+        modes(path, tmp_path / "out", labels="operator", progress=False)
+    assert not (tmp_path / "out").exists()
+
+
 def test_data_that_have_changed_since_are_refused(file, folder, tmp_path):
     copy = tmp_path / "modes"
     copy.mkdir()

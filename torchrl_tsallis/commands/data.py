@@ -128,6 +128,8 @@ class Modes(Reads):
 
     Args:
         out: folder to write.
+        labels: key of what is known of each episode, such as its operator, which what was found is compared with; mask
+            for the filter keys of robomimic. It is never used in the search.
         components: auto, or a number: then modes are looked for although one may be enough.
         train: of the mixtures.
         device: of the policies, such as cuda.
@@ -135,6 +137,7 @@ class Modes(Reads):
     """
 
     out: Path = Path("modes")
+    labels: str | None = None
     components: Literal["auto"] | int = "auto"
     train: ModesTraining = field(default_factory=ModesTraining)
     device: str = "cpu"
@@ -149,6 +152,7 @@ class Modes(Reads):
             self.out,
             **self.chosen(),
             **vars(self.train),
+            labels=self.labels,
             components=None if self.components == "auto" else self.components,
             device=self.device,
             overwrite=self.overwrite,
@@ -157,15 +161,16 @@ class Modes(Reads):
         )
         lines = [found.summary["sentence"], str(self.out / "modes.csv")]
         try:
-            from torchrl_tsallis.report.modes import write_modes_picture
+            from torchrl_tsallis.report.modes_page import write_modes_report
 
-            lines.append(str(write_modes_picture(self.out)))
+            lines.append(str(write_modes_report(self.out)))
         except ImportError as error:
-            note(f"no picture: {error}")
+            note(f"no page: {error}")
         if len(found.summary["modes"]) > 1:
             best = found.summary["recommended"]
             lines.append(f"tsallis curate {self.out} --mode {best} --out COPY    # that mode alone, in the same format")
             lines.append(f"tsallis train {self.out} --mode {best} --out POLICY   # a policy of it")
+            lines.append(f"tsallis train {self.out} --mode each --out POLICY     # one of all, which is told the mode")
         say({"out": str(self.out), **found.summary}, "\n".join(lines), self.json)
         return 0
 
@@ -176,14 +181,15 @@ class Train(Reads):
 
     Args:
         out: folder to write.
-        mode: number of a mode; the path is then the folder that tsallis modes left.
+        mode: number of a mode, or each for one policy that is told the mode; the path is then the folder that tsallis
+            modes left.
         train: of the policy.
         device: of the policy, such as cuda.
         overwrite: whether an earlier run in the folder is replaced.
     """
 
     out: Path
-    mode: int | None = None
+    mode: int | Literal["each"] | None = None
     train: PolicyTraining = field(default_factory=PolicyTraining)
     device: str = "cpu"
     overwrite: bool = False

@@ -24,6 +24,16 @@ BETA, LR = 0.5, 1e-3
 LEAST_STEPS = 20
 
 
+def steps_between(rows: int, batch_size: int) -> int:
+    """Steps between two updates of the responsibilities: an epoch, and not fewer than 20.
+
+    Examples:
+        >>> steps_between(10_000, 256), steps_between(100, 256)
+        (39, 20)
+    """
+    return max(LEAST_STEPS, rows // batch_size)
+
+
 def train_mixtures(
     sets: Sequence[TensorDictBase],
     sizes: Sequence[int],
@@ -49,7 +59,7 @@ def train_mixtures(
         The mixtures, set by set, with their loss.
     """
     of_a_set, count = sum(sizes), len(sets)
-    every = max(LEAST_STEPS, sum(map(len, sets)) // count // batch_size)
+    every = steps_between(sum(map(len, sets)) // count, batch_size)
     obs_dim, action_dim = sets[0]["observation"].shape[1], sets[0]["action"].shape[1]
     episodes = [int(data["episode"].max()) + 1 for data in sets]
     first = [sum(episodes[:k]) for k in range(count)]

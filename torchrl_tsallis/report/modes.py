@@ -1,18 +1,12 @@
-"""A picture of the modes among demonstrations: who belongs together, and how sure that is."""
+"""Drawings of the modes among demonstrations: who belongs together, how sure that is, and how they differ."""
 
 from __future__ import annotations
 
-import os
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from torchrl_tsallis.data.modes_folder import ModesFolder
-from torchrl_tsallis.jobs.files import atomic_path
-from torchrl_tsallis.report.figures import new_figure
 from torchrl_tsallis.report.svg import MUTED
-from torchrl_tsallis.runs.saved import load_tensors
 
 #: Colours of the largest modes that can be told apart without seeing red and green; all others are grey.
 COLOURS = ("#0072b2", "#e69f00", "#009e73", "#cc79a7", "#56b4e9", "#d55e00", "#f0e442")
@@ -66,25 +60,18 @@ def draw_modes(axes: Any, mode: np.ndarray, membership: np.ndarray) -> None:
     axes.legend(fontsize=8, ncols=3, loc="upper center", bbox_to_anchor=(0.5, 1.18), frameon=False)
 
 
-def write_modes_picture(folder: str | os.PathLike[str]) -> Path:
-    """Draws ``modes.png`` of a folder that ``tsallis modes`` left.
+def draw_differences(axes: Any, apart: np.ndarray, colours: tuple[str, str]) -> None:
+    """Where two modes differ: dark where their policies would do other things.
 
     Args:
-        folder: of the modes.
-
-    Returns:
-        The picture.
-
-    Raises:
-        ImportError: if matplotlib is not installed.
-        FileNotFoundError: if it is no such folder.
+        axes: to draw on.
+        apart: mean distance of the mean actions by part of an episode and dimension of the action, ``[T, A]``.
+        colours: of the two, whose larger one is drawn above.
     """
-    found = ModesFolder.open(folder)
-    pairs = load_tensors(found.path / "pairs.safetensors")["pairs"].numpy()
-    figure, (left, right) = new_figure(10, 4, columns=2)
-    draw_together(left, pairs, found.mode)
-    draw_modes(right, found.mode, found.membership)
-    place = found.path / "modes.png"
-    with atomic_path(place) as path, open(path, "wb") as file:
-        figure.savefig(file, format="png")
-    return place
+    parts, dims = apart.shape
+    image = axes.imshow(apart.T, aspect="auto", cmap="Greys", vmin=0, interpolation="none", extent=(0, 100, dims, 0))
+    axes.set(xlabel="% of the episode", ylabel="dimension of the action")
+    axes.set_yticks(np.arange(dims) + 0.5, range(dims), fontsize=8 if dims <= 12 else 4)
+    for k, colour in enumerate(colours):
+        axes.plot([50 * k, 50 * (k + 1)], [0, 0], color=colour, linewidth=5, clip_on=False, solid_capstyle="butt")
+    axes.figure.colorbar(image, ax=axes, label="robust deviations")

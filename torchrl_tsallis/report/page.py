@@ -19,6 +19,15 @@ from torchrl_tsallis.version import __version__
 PAGE = "report.html"
 
 
+def need_packages() -> None:
+    """Raises ImportError where jinja2 or matplotlib is not installed; the message names the extra."""
+    for package in ("jinja2", "matplotlib"):
+        try:
+            importlib.import_module(package)
+        except ImportError as error:
+            raise ImportError(f"the report needs {package}: pip install 'torchrl-tsallis[report]'") from error
+
+
 def write_report(folder: str | os.PathLike[str]) -> Path:
     """Writes ``report.html``, and PNG files of its pictures, into the folder of a rating.
 
@@ -39,11 +48,7 @@ def write_report(folder: str | os.PathLike[str]) -> Path:
         OSError: if a file cannot be written; those that are there stay whole.
         ValueError: if a file is broken; the message names it.
     """
-    for package in ("jinja2", "matplotlib"):
-        try:
-            importlib.import_module(package)
-        except ImportError as error:
-            raise ImportError(f"the report needs {package}: pip install 'torchrl-tsallis[report]'") from error
+    need_packages()
     rated = RatingsFolder.open(folder)
     judged = contents.judged(rated)
     drawn = panels(rated, judged["calibration"])

@@ -27,6 +27,8 @@ from torchrl_tsallis.trainers.offline import make_offline_trainer
 
 #: Power of the scale-weighted likelihood, and the size of AdaTerm's steps.
 BETA, LR = 0.5, 1e-3
+#: Passes over the data, and bounds of the steps that they give.
+EPOCHS, LEAST_STEPS, MOST_STEPS = 40, 1000, 10_000
 
 
 @dataclass(frozen=True)
@@ -40,6 +42,19 @@ class Split:
 
     seed: int
     held_out: Tensor
+
+
+def default_steps(rows: int, batch_size: int = 256) -> int:
+    """Gradient steps for so much data: 40 passes, from 1000 to 10,000 steps, in hundreds.
+
+    More passes fit the training episodes better and other episodes worse: on 25 episodes of a person, the squared
+    errors on held-out episodes were 1.7 and 2.6 times what the policies expected after 300 and 1000 steps.
+
+    Examples:
+        >>> default_steps(30_000), default_steps(500), default_steps(10**6)
+        (4700, 1000, 10000)
+    """
+    return min(MOST_STEPS, max(LEAST_STEPS, round(EPOCHS * rows / batch_size / 100) * 100))
 
 
 def make_splits(data: TensorDictBase, *, seeds: int, folds: int) -> list[Split]:
@@ -105,6 +120,25 @@ class Members:
                 distance[:, part] = (share * squared_distance(normal)).cpu()
             rating[:, part] = self.loss.rating(scaled).cpu()
         return distance, rating
+
+    def means(self, data: TensorDictBase, *, chunk_size: int = 2048) -> Tensor:
+        """Mean action of every member at every row, in the units of the data, ``[M, N, A]``.
+
+        Args:
+            data: ``observation`` ``[N, O]`` and ``action`` ``[N, A]``, in their own units.
+            chunk_size: rows at once.
+        """
+        device = next(self.loss.parameters()).device
+        out = torch.empty(len(self.scalings), *data["action"].shape)
+        for start in range(0, len(data), chunk_size):
+            part = slice(start, min(start + chunk_size, len(data)))
+            rows = data[part].select("observation", "action").clone()
+            scaled: Any = torch.stack([scaling(rows) for scaling in self.scalings]).to(device)  # type: ignore[arg-type]
+            with evaluating(self.loss, self.loss.actor_network):
+                dist = get_stacked_dist(self.loss.actor_network, scaled, self.loss.actor_network_params)
+            for member, scaling in enumerate(self.scalings):
+                out[member, part] = scaling.unscale_action(dist.mean[member].cpu())
+        return out
 
 
 def train_members(

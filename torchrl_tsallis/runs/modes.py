@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from itertools import combinations
 from typing import Any
 
 import torch
 from tensordict import TensorDictBase
+from torch import Tensor
 
 from torchrl_tsallis._checks import check_number
 from torchrl_tsallis._device import check_device
@@ -16,14 +18,18 @@ from torchrl_tsallis.data.modes_folder import KIND, ModesFolder
 from torchrl_tsallis.data.rows import take_rows
 from torchrl_tsallis.modes.find import UPDATES, find_modes
 from torchrl_tsallis.modes.found import AGREE, Modes
-from torchrl_tsallis.modes.train import BETA, LR
+from torchrl_tsallis.modes.train import BETA, LR, steps_between
+from torchrl_tsallis.runs.differences import mode_differences
 from torchrl_tsallis.runs.folder import FORMAT, RUN, check_free, new_folder, write_csv, write_json
+from torchrl_tsallis.runs.labels import compare_labels, read_labels
 from torchrl_tsallis.runs.saved import save_tensors, versions
 from torchrl_tsallis.runs.source import Source, identity, load_source
 
 #: Certainty of a mode, and how much larger than the next one it has to be, for a recommendation that is sure.
 CERTAIN, LARGER = 0.8, 1.25
 MODES = ("episode", "source", "steps", "mode", "membership")
+LABELS = ("episode", "source", "label")
+DIFFERENCES = ("mode", "other", "part", "action", "difference")
 
 
 def modes(
@@ -35,6 +41,7 @@ def modes(
     episode: str | None = None,
     format: str | None = None,
     filter_key: str | None = None,
+    labels: str | None = None,
     components: int | None = None,
     starts: int = 4,
     updates: int = UPDATES,
@@ -55,6 +62,8 @@ def modes(
         episode: key of the episode's number (npz, CSV).
         format: name of the format.
         filter_key: subset of the file's episodes.
+        labels: key of what is known of each episode, such as its operator, which what was found is compared with;
+            ``mask`` for the filter keys of robomimic. It is never used in the search. Default: none.
         components: of each mixture. Default: 6, and one mode where that is enough.
         starts: of mixtures.
         updates: of the responsibilities, an epoch between two.
@@ -83,18 +92,31 @@ def modes(
     """
     check_device(device)
     check_free(out, overwrite, path_or_data if isinstance(path_or_data, (str, os.PathLike)) else None)
-    source = load_source(path_or_data, obs=obs, action=action, episode=episode, format=format, filter_key=filter_key)
+    chosen = {"obs": obs, "action": action, "episode": episode, "format": format, "filter_key": filter_key}
+    source = load_source(path_or_data, **chosen)  # type: ignore[arg-type]
+    known = None if labels is None else read_labels(path_or_data, source, labels, {**chosen, "observation": obs})
     numbers: dict[str, Any] = {"starts": starts, "updates": updates, "batch_size": batch_size}
     numbers |= {"components": 6 if components is None else components, "seed": seed}
     with new_folder(out, overwrite=overwrite) as folder:
         found = find_modes(source.data, **numbers, always=components is not None, device=device, progress=progress)
-        lengths = source.episodes().lengths.tolist()
+        episodes = source.episodes()
+        lengths = episodes.lengths.tolist()
         number = found.of_episodes
         member = found.membership[number, torch.arange(len(number))]
         columns = (source.names, lengths, number.tolist(), member.tolist())
         write_csv(folder / "modes.csv", MODES, zip(range(len(number)), *columns, strict=True))
         save_tensors(folder / "pairs.safetensors", {"pairs": found.pairs.float()})
-        write_json(folder / "summary.json", describe(found, lengths, components is not None))
+        summary = describe(found, lengths, components is not None)
+        if known is not None:
+            summary["labels"] = {"key": labels, **compare_labels(known, number.tolist())}
+            write_csv(folder / "labels.csv", LABELS, zip(range(len(number)), source.names, known, strict=True))
+        write_json(folder / "summary.json", summary)
+        steps = updates * steps_between(len(source.data), batch_size)  # as a component of a mixture
+        of_policies = {"steps": steps, "batch_size": batch_size, "seed": seed}
+        compared, apart = mode_differences(
+            source.data, found.groups, episodes, **of_policies, device=device, progress=progress
+        )
+        write_csv(folder / "differences.csv", DIFFERENCES, rows_of(compared, apart))
         write_json(
             folder / RUN,
             {
@@ -162,12 +184,21 @@ def describe(found: Modes, lengths: Sequence[int], asked: bool = False) -> dict[
     }
 
 
-def mode_source(folder: str | os.PathLike[str], mode: int) -> Source:
-    """The demonstrations of one mode, read again from where they were.
+def rows_of(compared: Sequence[int], apart: Tensor) -> Iterator[tuple[Any, ...]]:
+    """Lines of ``differences.csv``: each pair of modes once."""
+    for a, b in combinations(range(len(compared)), 2):
+        for part, row in enumerate(apart[a, b].tolist()):
+            for action, value in enumerate(row):
+                yield compared[a], compared[b], part, action, value
+
+
+def mode_source(folder: str | os.PathLike[str], mode: int | str) -> Source:
+    """The demonstrations of one mode, or of each, read again from where they were.
 
     Args:
         folder: that :func:`modes` left.
-        mode: number of the mode.
+        mode: number of the mode, or ``each``: all rows, whose observation goes on with a 1 for the episode's mode and a
+            0 for each other one of more than one episode; an episode alone has zeros.
 
     Returns:
         The rows of its episodes, with their names.
@@ -176,9 +207,10 @@ def mode_source(folder: str | os.PathLike[str], mode: int) -> Source:
         FileNotFoundError: if folder or data are not there.
         ValueError: if there is no such mode, the data were in memory, or they are others now.
     """
-    check_number("mode", mode, low=0, integer=True)
+    if mode != "each":
+        check_number("mode", mode, low=0, integer=True)
     found = ModesFolder.open(folder)
-    names, about = found.episodes_of(mode), found.run["data"]
+    names, about = found.names if isinstance(mode, str) else found.episodes_of(mode), found.run["data"]
     if about["format"] == "memory":
         raise ValueError(f"the data of {str(folder)!r} were in memory: save them, and find the modes of the file")
     keys = about["keys"]
@@ -187,6 +219,16 @@ def mode_source(folder: str | os.PathLike[str], mode: int) -> Source:
     source = load_source(about["path"], obs=keys["observation"], action=action, **chosen)
     if identity(source.data) != about["identity"]:
         raise ValueError(f"{about['path']!r} has changed since its modes were found: find them again")
+    chosen = {**source.chosen, "mode": str(mode)}
+    if isinstance(mode, str):
+        numbers, counts = torch.from_numpy(found.mode).unique(return_counts=True)
+        large = numbers[counts > 1]
+        asked = torch.from_numpy(found.mode)[source.episodes().of_rows()][:, None] == large
+        width = source.data["observation"].shape[1]
+        data = source.data.clone(False)
+        data["observation"] = torch.cat([data["observation"], asked.to(data["observation"])], 1)
+        layout = (*source.layout, ("mode", width, width + len(large)))
+        return replace(source, data=data, layout=layout, chosen=chosen)
     own = torch.tensor([name in set(names) for name in source.names])
     data = take_rows(source.data, own[source.episodes().of_rows()])
-    return replace(source, data=data, names=tuple(names), chosen={**source.chosen, "mode": str(mode)})
+    return replace(source, data=data, names=tuple(names), chosen=chosen)

@@ -189,11 +189,43 @@ class Reader(ABC):
         """What else the source says of itself."""
         return {}
 
+    def labels(self, key: str) -> dict[str, str]:
+        """What the file says of each episode under a key, as text, by the episode's name.
+
+        Raises:
+            KeyError: if there is no such key.
+            ValueError: if it changes within an episode.
+        """
+        if key not in self.columns():
+            raise KeyError(f"{str(self.path)!r} has no {key!r}, only {sorted(self.columns())}")
+        return {
+            episode.name: one_label(np.asarray(episode.columns[key]).reshape(-1).tolist(), key, episode.name, self.path)
+            for episode in self.episodes([key], None, ())
+        }
+
     def read(self) -> Demonstrations:
         """Reads the demonstrations."""
         from torchrl_tsallis.data.readers.assemble import assemble
 
         return assemble(self)
+
+
+def one_label(values: Sequence[Any], key: str, episode: str, path: Path) -> str:
+    """The one value that an episode has under a key, as text.
+
+    Raises:
+        ValueError: if there are several.
+
+    Examples:
+        >>> one_label([2.0, 2.0], "operator", "0", Path("table.csv"))
+        '2'
+    """
+    found = sorted({str(int(x)) if isinstance(x, float) and x.is_integer() else str(x) for x in values})
+    if len(found) != 1:
+        raise ValueError(
+            f"{key!r} of {str(path)!r} is {found[:3]} within episode {episode!r}: a label says one thing of an episode"
+        )
+    return found[0]
 
 
 def register(reader: type[Reader]) -> type[Reader]:

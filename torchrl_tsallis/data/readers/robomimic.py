@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,9 @@ import numpy as np
 
 from torchrl_tsallis.data.readers.base import Column, Options, RawEpisode, Reader, by_number, register
 from torchrl_tsallis.data.readers.hdf5 import column, datasets, is_hdf5, open_hdf5, value
+
+#: Filter keys that say nothing of who demonstrated.
+_SPLIT = re.compile(r"(^|_)(train|valid)$")
 
 
 @register
@@ -94,6 +98,18 @@ class RobomimicReader(Reader):
     def facts(self) -> dict[str, Any]:
         """Masks and the environment's name."""
         return self._facts
+
+    def labels(self, key: str) -> dict[str, str]:
+        """Of a dataset; ``mask`` is the filter keys that list an episode, but for those of training and validation."""
+        if key != "mask":
+            return super().labels(key)
+        lists = {name: listed for name, listed in self._facts["masks"].items() if not _SPLIT.search(name)}
+        if not lists:
+            raise KeyError(f"{str(self.path)!r} has no filter keys but those of training and validation")
+        return {
+            episode: "+".join(name for name, listed in lists.items() if episode in listed) or "none"
+            for episode in self._names
+        }
 
     def episodes(self, keys: Sequence[str], reward: str | None, following: Sequence[str]) -> Iterator[RawEpisode]:
         """Reads the groups one by one."""

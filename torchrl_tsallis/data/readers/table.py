@@ -12,7 +12,7 @@ import torch
 from tensordict import TensorDict
 
 from torchrl_tsallis.data.episodes import find_episodes
-from torchrl_tsallis.data.readers.base import Column, Options, RawEpisode, Reader, naming, reading, register
+from torchrl_tsallis.data.readers.base import Column, Options, RawEpisode, Reader, naming, one_label, reading, register
 
 #: What entries are usually called, by role.
 NAMES = {
@@ -124,6 +124,23 @@ class Table(Reader):
                 None if times is None else times[part],
             )
 
+    def labels(self, key: str) -> dict[str, str]:
+        """Of a column, which may be text."""
+        if key not in self._columns:
+            raise KeyError(f"{str(self.path)!r} has no {key!r}, only {sorted(self._columns)}")
+        cells = self._texts(key)
+        if len(cells) != self._size():
+            raise ValueError(f"{key!r} of {str(self.path)!r} has {len(cells)} rows, the action {self._size()}")
+        return {
+            name: one_label(cells[start : start + length], key, name, self.path)
+            for name, start, length, _ in self._cuts
+        }
+
+    def _texts(self, key: str) -> list[Any]:
+        """The cells of a column, as the file has them."""
+        array = self._array(key)
+        return list(array.reshape(len(array), -1)[:, 0].tolist())
+
     def _rows(self, key: str) -> np.ndarray:
         array = self._array(key)
         if len(array) != self._size():
@@ -192,6 +209,9 @@ class CsvReader(Table):
                     ) from error
             self._numbers[key] = out
         return self._numbers[key]
+
+    def _texts(self, key: str) -> list[Any]:
+        return [cell.strip() for cell in self._cells[key]]
 
     def _size(self) -> int:
         return len(next(iter(self._cells.values()), []))
