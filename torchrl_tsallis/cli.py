@@ -72,3 +72,7 @@ def main(args: Sequence[str] | None = None) -> None:
         sys.stderr.write(f"tsallis: {_line(error)}\n")
         code = 1
     sys.exit(code)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

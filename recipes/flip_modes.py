@@ -1,0 +1,114 @@
+"""Whose page flips are these? Modes among demonstrations of two operators, who differ in speed and height.
+
+Records both operators, finds modes without labels, and compares them with who it was; may be killed and started again::
+
+    python recipes/flip_modes.py
+    python recipes/flip_modes.py mode=report results=docs/results
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import hydra
+import numpy as np
+import torch
+from common import keep_settings
+from omegaconf import DictConfig, OmegaConf
+from tensordict import TensorDict
+
+from torchrl_tsallis.data import save_demonstrations
+from torchrl_tsallis.data.flip_demonstrations import record_flips
+from torchrl_tsallis.data.teleoperation import draw_style
+from torchrl_tsallis.envs import make_page_flip
+from torchrl_tsallis.jobs import atomic_path, run_jobs, tick
+from torchrl_tsallis.modes import adjusted_rand_index
+from torchrl_tsallis.run import modes
+
+COLUMNS = ("seed", "agreement", "trajectory", "operator", "pages", "mode", "membership", "recommended")
+
+
+def record(cfg: DictConfig, seed: int) -> tuple[TensorDict, list[int]]:
+    """Both operators in turns, ``[2 n 500]``, with who it was under ``operator``; and the pages that each flipped."""
+    parts, pages = [], []
+    for episode in range(cfg.trajectories * len(cfg.operators)):
+        who = episode % len(cfg.operators)
+        number = 100_000 * (seed + 1) + episode
+        drawn = draw_style(np.random.default_rng([number, 1]))
+        style = replace(drawn, **list(cfg.operators.values())[who])
+        data, facts = record_flips(make_page_flip, seed=number, style=style)
+        rows = data.select("observation", "action", "is_init", "next")
+        parts.append(
+            rows.set("episode", torch.full((len(rows),), episode)).set("operator", torch.full((len(rows),), who))
+        )
+        pages.append(facts["flips"])
+    return torch.cat(parts), pages
+
+
+def search(seed: int, cfg: DictConfig) -> None:
+    """Records, finds the modes and writes the rows of one seed, in a process of its own."""
+    file = Path(cfg.output) / f"seed_{seed}.csv"
+    if not file.exists():
+        data, pages = record(cfg, seed)
+        path = Path(cfg.output) / f"demonstrations_{seed}.safetensors"
+        save_demonstrations(path, data, {"pages": pages})
+        folder = Path(cfg.output) / f"modes_{seed}"
+        found = modes(path, folder, labels="operator", seed=seed, progress=False, overwrite=True, **cfg.search)
+        known = [line.rpartition(",")[2] for line in (folder / "labels.csv").read_text().splitlines()[1:]]
+        names, text = list(cfg.operators), io.StringIO()
+        writer = csv.writer(text, lineterminator="\n")
+        for k, (who, mode) in enumerate(zip(known, found.mode.tolist(), strict=True)):
+            best = int(mode == found.summary["recommended"])
+            facts = [f"{found.summary['agreement']:.4f}", k, names[int(who)], pages[k], mode]
+            writer.writerow([seed, *facts, f"{found.membership[k]:.4f}", best])
+        with atomic_path(file) as temporary:
+            temporary.write_text(text.getvalue(), encoding="utf-8")
+    tick()
+
+
+def report(results: Path) -> str:
+    """The table of a raw file, a line a seed."""
+    with open(results / "flip_modes.csv", newline="", encoding="utf-8") as file:
+        rows: list[dict[str, Any]] = list(csv.DictReader(file))
+    lines = ["| seed | agreement of the starts | modes: episodes of each operator | Rand index |", "|---|---|---|---|"]
+    for seed in sorted({int(row["seed"]) for row in rows}):
+        own = [row for row in rows if int(row["seed"]) == seed]
+        names, mode = sorted({row["operator"] for row in own}), torch.tensor([int(row["mode"]) for row in own])
+        who = torch.tensor([names.index(row["operator"]) for row in own])
+        groups = []
+        for k in mode.unique().tolist():
+            counts = {name: int((who[mode == k] == i).sum()) for i, name in enumerate(names)}
+            groups.append(", ".join(f"{count} {name}" for name, count in counts.items() if count))
+        index = adjusted_rand_index(mode, who)
+        lines.append(f"| {seed} | {own[0]['agreement']} | {' / '.join(groups)} | {index:.2f} |")
+    text = "\n".join(lines)
+    with atomic_path(results / "flip_modes.md") as path:
+        path.write_text(text + "\n", encoding="utf-8")
+    return text
+
+
+@hydra.main(version_base="1.3", config_path=".", config_name="flip_modes")
+def main(cfg: DictConfig) -> None:
+    """Runs and shows, or only shows."""
+    if cfg.mode not in ("run", "report"):
+        raise SystemExit(f"no mode {cfg.mode!r}: choose run or report")
+    results = Path(cfg.results)
+    if cfg.mode == "run":
+        cfg.output = str(Path(cfg.output).absolute())
+        settings: Any = OmegaConf.to_container(cfg, resolve=True)
+        keep_settings(Path(cfg.output) / "settings.json", settings, ("operators", "trajectories", "search"))
+        bar = {"desc": "finding modes", "unit": "seed", "progress": cfg.progress, "workers": cfg.workers}
+        run_jobs(partial(search, cfg=cfg), list(cfg.seeds), total=len(cfg.seeds), **bar)
+        parts = [(Path(cfg.output) / f"seed_{seed}.csv").read_text(encoding="utf-8") for seed in cfg.seeds]
+        with atomic_path(results / "flip_modes.csv") as path:
+            path.write_text(",".join(COLUMNS) + "\n" + "".join(parts), encoding="utf-8")
+    print(report(results))
+
+
+if __name__ == "__main__":
+    main()
