@@ -11,6 +11,10 @@ On a GPU many cells are one program; the policies may walk elsewhere, where the 
     python recipes/ant_modes.py mode=train device=cuda block=15 workers=6
     python recipes/ant_modes.py
 
+A video of each mode's policy::
+
+    python recipes/ant_modes.py mode=film part=[gaits] seeds=[200]
+
 The tables from the raw files alone::
 
     python recipes/ant_modes.py mode=report results=docs/results
@@ -27,7 +31,7 @@ from ant_common import check_names, demonstrations
 from ant_sweep import of_condition
 from ant_units import Key
 from common import as_list, keep_settings
-from modes_cell import answer_of, evaluate, search, train
+from modes_cell import answer_of, evaluate, film, search, train
 from modes_report import read_rows, report, write_rows
 from omegaconf import DictConfig, OmegaConf
 
@@ -64,6 +68,8 @@ def run(cfg: DictConfig, keys: list[Key]) -> None:
     try:
         run_jobs(partial(search, cfg=cfg), jobs, total=len(jobs), desc="finding modes", **bar)
         run_jobs(partial(train, cfg=cfg), jobs, total=len(jobs), desc="training policies", **bar)
+        if cfg.mode == "film":
+            run_jobs(partial(film, cfg=cfg), keys, total=len(keys), desc="filming", **bar)
         if cfg.mode == "run":
             run_jobs(partial(evaluate, cfg=cfg), keys, total=len(keys), desc="letting them walk", **bar)
     except KeyboardInterrupt:
@@ -74,12 +80,12 @@ def run(cfg: DictConfig, keys: list[Key]) -> None:
 def main(cfg: DictConfig) -> None:
     """Runs and shows, or only shows."""
     results = Path(cfg.results)
-    if cfg.mode not in ("run", "train", "report"):
-        raise SystemExit(f"no mode {cfg.mode!r}: choose run, train or report")
+    if cfg.mode not in ("run", "train", "film", "report"):
+        raise SystemExit(f"no mode {cfg.mode!r}: choose run, train, film or report")
     if cfg.mode != "report":
         keys = wanted_of(cfg)
         run(cfg, keys)
-    if cfg.mode == "train":
+    if cfg.mode in ("train", "film"):
         return
     if cfg.mode == "run":
         write_rows(results, {key: answer_of(key, cfg) for key in keys})

@@ -16,7 +16,7 @@ from torchrl import torchrl_logger
 from torchrl_tsallis.data import find_episodes
 from torchrl_tsallis.data.robust_scaling import RobustScaling
 from torchrl_tsallis.envs import make_ant
-from torchrl_tsallis.evaluation import evaluate_policies
+from torchrl_tsallis.evaluation import evaluate_policies, record_rollout
 from torchrl_tsallis.jobs import atomic_path, tick
 from torchrl_tsallis.modes import Modes, find_modes_of_each
 from torchrl_tsallis.runs.members import Split, train_members
@@ -94,24 +94,39 @@ def train(keys: tuple[Key, ...], cfg: DictConfig) -> None:
     tick()
 
 
+def policies_of(key: Key, cfg: DictConfig) -> dict[str, ScaledMeanPolicy]:
+    """The policies of a cell's modes."""
+    state: dict[str, dict[str, dict[str, torch.Tensor]]] = {}
+    for name, value in load_tensors(file_of(key, "policies", cfg, "safetensors")).items():
+        mode, part, rest = name.split(":")
+        state.setdefault(mode, {}).setdefault(part, {})[rest] = value
+    return {
+        mode: ScaledMeanPolicy.of(own["actor"], RobustScaling.from_state_dict(own["scaling"]))
+        for mode, own in state.items()
+    }
+
+
 def evaluate(key: Key, cfg: DictConfig) -> None:
     """Lets the policies of a cell's modes walk, in a process of its own."""
     quiet()
     file = file_of(key, "returns", cfg)
     if not file.exists():
-        state: dict[str, dict[str, dict[str, torch.Tensor]]] = {}
-        for name, value in load_tensors(file_of(key, "policies", cfg, "safetensors")).items():
-            mode, part, rest = name.split(":")
-            state.setdefault(mode, {}).setdefault(part, {})[rest] = value
-        policies = {
-            mode: ScaledMeanPolicy.of(own["actor"], RobustScaling.from_state_dict(own["scaling"]))
-            for mode, own in state.items()
-        }
+        policies = policies_of(key, cfg)
         options = {"episodes": cfg.evaluation.episodes, "seed": cfg.evaluation.seed, "workers": 0, "progress": False}
         returns: dict[str, list[float]] = {mode: [] for mode in policies}
         for row in evaluate_policies(policies, env_fn=make_ant, **options):
             returns[row["policy"]].append(row["return"])
         write(file, returns)
+    tick()
+
+
+def film(key: Key, cfg: DictConfig) -> None:
+    """A video of each mode's policy, in a process of its own."""
+    quiet()
+    for mode, policy in policies_of(key, cfg).items():
+        place = Path(cfg.results).absolute() / f"modes_{key.trio}_{key.task}_{key.std:g}_{key.seed}_{mode}.gif"
+        options = {"seconds": cfg.film_seconds, "seed": cfg.evaluation.seed, "step_seconds": 0.0165}
+        record_rollout(policy, place, env_fn=make_ant, size=(240, 180), **options)
     tick()
 
 

@@ -13,6 +13,7 @@ import torch
 from ant_report import as_markdown
 from ant_units import Key
 from figure3_report import read_raw
+from modes_picture import draw
 
 from torchrl_tsallis.jobs import atomic_path
 from torchrl_tsallis.modes import adjusted_rand_index
@@ -82,37 +83,45 @@ def each(values: Sequence[float], digits: int = 0) -> str:
     return f"{np.median(known):.{digits}f} ({listed})" if known else "-"
 
 
-def cell_lines(seeds: Mapping[int, Rows], assigned: Mapping[int, Rows], others: Rows) -> dict[str, str]:
-    """What the table says of one cell."""
-    rand, experts_alone, count, best, chosen = [], [], [], [], []
-    for seed, rows in seeds.items():
-        mode, who = (torch.tensor([int(row[name]) for row in assigned[seed]]) for name in ("mode", "demonstrator"))
-        expert = who < 3
-        rand.append(adjusted_rand_index(mode, who))
-        experts_alone.append(adjusted_rand_index(mode[expert], who[expert]))
-        count.append(len({row["component"] for row in rows}))
-        chosen.append(medians([row for row in rows if row["recommended"] == "1"]))
-        best.append(max(medians([row for row in rows if row["component"] == name]) for name in
-                        {row["component"] for row in rows}))  # fmt: skip
-    line = {"policies": each(count), "Rand index": each(rand, 2), "of the experts": each(experts_alone, 2)}
-    line |= {"recommended mode": each(chosen), "best mode": each(best)}
+def values_of(seeds: Mapping[int, Rows], others: Rows) -> dict[str, list[float]]:
+    """Median return of each seed: of the recommended mode's policy, the best mode's, and policies of all episodes."""
+    out: dict[str, list[float]] = {"recommended mode": [], "best mode": []}
+    for rows in seeds.values():
+        by_mode = {
+            name: [row for row in rows if row["component"] == name] for name in {row["component"] for row in rows}
+        }
+        out["recommended mode"].append(medians([row for row in rows if row["recommended"] == "1"]))
+        out["best mode"].append(max(map(medians, by_mode.values())))
     for method, label in OTHERS.items():
         own = [[row for row in others if (row["method"], row["seed"]) == (method, seed)] for seed in seeds]
-        line[label] = each([medians(rows) for rows in own])
-    return line
+        out[label] = [medians(rows) for rows in own]
+    return out
+
+
+def agreement_of(assigned: Mapping[int, Rows]) -> dict[str, str]:
+    """How the modes of each seed go with who demonstrated: of all episodes, and of the experts' alone."""
+    all_of, experts, count = [], [], []
+    for rows in assigned.values():
+        mode, who = (torch.tensor([int(row[name]) for row in rows]) for name in ("mode", "demonstrator"))
+        all_of.append(adjusted_rand_index(mode, who))
+        experts.append(adjusted_rand_index(mode[who < 3], who[who < 3]))
+        count.append(int((mode.bincount() > 2).sum()))
+    return {"modes of 3 or more": each(count), "Rand index": each(all_of, 2), "of the experts": each(experts, 2)}
 
 
 def report(returns: Rows, assigned: Rows, folder: Path, *, known: Path) -> str:
-    """Writes ``modes.md``; returns the text."""
+    """Writes ``modes.md`` and ``modes.png``; returns the text."""
     others = read_raw(known) if known.exists() else []
-    found, table = by_cell(assigned), []
+    found, table, cells = by_cell(assigned), [], {}
     for (trio, task, std), seeds in sorted(by_cell(returns).items()):
         own = [r for r in others if (r["trio"], r["task"], r["std"], r["scale"]) == (trio, task, std, 1.0)]
-        line = {"trio": trio, "task": task, "std": f"{std:g}"}
-        table.append(line | cell_lines(seeds, found[trio, task, std], own))
+        cells[trio, task, std] = values = values_of(seeds, own)
+        line = {"trio": trio, "task": task, "std": f"{std:g}"} | agreement_of(found[trio, task, std])
+        table.append(line | {name: each(numbers) for name, numbers in values.items()})
     text = (
         f"Median over seeds (value of each seed); returns are medians of a policy's episodes:\n\n{as_markdown(table)}"
     )
     with atomic_path(folder / "modes.md") as path:
         path.write_text(text + "\n", encoding="utf-8")
+    draw(cells, folder / "modes.png")
     return text
