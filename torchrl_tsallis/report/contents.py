@@ -12,7 +12,8 @@ import numpy as np
 
 from torchrl_tsallis.data.ratings_folder import RatingsFolder
 from torchrl_tsallis.report.figures import MARKED, MOST
-from torchrl_tsallis.report.signals import RETURN, SIGNALS, Signal, most_extreme, spearman
+from torchrl_tsallis.report.signals import RETURN, SIGNALS, Signal, most_extreme
+from torchrl_tsallis.runs.judgement import spearman, stand_out
 
 #: Episodes in the table and in the picture of the intervals, and episodes of which the course is drawn.
 LISTED, DRAWN = 200, 6
@@ -35,23 +36,6 @@ def number(value: float, digits: int = 3) -> str:
 def column(rated: RatingsFolder, key: str) -> np.ndarray:
     """A column of ``episodes.csv``, ``[E]``; NaN where it is missing."""
     return rated.episodes.get(key, np.full(len(rated.names), np.nan))
-
-
-def stand_out(mean: np.ndarray, low: np.ndarray) -> np.ndarray:
-    """Episodes whose interval lies above the median by three robust deviations, ``[E]`` bool.
-
-    Args:
-        mean: surprise, ``[E]``.
-        low: lower end of its interval, ``[E]``; NaN where there is none.
-
-    Examples:
-        >>> stand_out(np.array([1.0, 1.1, 0.9, 9.0]), np.array([0.5, 0.6, np.nan, 8.0])).tolist()
-        [False, False, False, True]
-    """
-    if np.isnan(mean).all():
-        return np.zeros(len(mean), dtype=bool)
-    median = np.nanmedian(mean)
-    return low > median + 3 * 1.4826 * np.nanmedian(np.abs(mean - median))
 
 
 def stretch(surprise: np.ndarray) -> tuple[int, int] | None:
@@ -125,7 +109,9 @@ def beside(rated: RatingsFolder) -> list[dict[str, Any]]:
     for signal in shown(rated):
         values = column(rated, signal.key)
         first = [rated.names[k] for k in most_extreme(values, signal.extreme)]
-        out.append({"signal": signal, "rho": number(spearman(values, surprise), 2).replace("-", "−"), "first": first})
+        few = np.isfinite(values + surprise).sum() < 3
+        rho = math.nan if few else spearman(values, surprise, constant=math.nan)
+        out.append({"signal": signal, "rho": number(rho, 2).replace("-", "−"), "first": first})
     return out
 
 

@@ -93,31 +93,6 @@ RETURN = Signal(
 )
 
 
-def spearman(x: np.ndarray, y: np.ndarray) -> float:
-    """Spearman's rank correlation of the pairs that are both there; NaN where less than three are, or one is constant.
-
-    Args:
-        x: ``[E]``, NaN where missing.
-        y: ``[E]``.
-
-    Examples:
-        >>> spearman(np.array([1.0, 2.0, 9.0, np.nan]), np.array([3.0, 2.0, 1.0, 0.0]))
-        -1.0
-    """
-    there = ~(np.isnan(x) | np.isnan(y))
-    if there.sum() < 3:
-        return float("nan")
-    a, b = _ranks(x[there]), _ranks(y[there])
-    size = float(np.sqrt((a * a).sum() * (b * b).sum()))
-    return round(float((a * b).sum()) / size, 12) if size else float("nan")
-
-
-def _ranks(values: np.ndarray) -> np.ndarray:
-    """Ranks about 0; equal values share their mean rank."""
-    _, inverse, count = np.unique(values, return_inverse=True, return_counts=True)
-    return (np.cumsum(count) - (count + 1) / 2)[inverse.reshape(-1)] - (len(values) - 1) / 2
-
-
 def most_extreme(values: np.ndarray, extreme: str, count: int = 3) -> list[int]:
     """Episodes to look at first by a signal.
 

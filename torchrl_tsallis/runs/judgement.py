@@ -49,16 +49,27 @@ def ranks(values: np.ndarray) -> np.ndarray:
     return (np.cumsum(count) - (count + 1) / 2)[inverse.reshape(-1)]
 
 
-def spearman(x: np.ndarray, y: np.ndarray) -> float:
-    """Spearman's rank correlation; 0 where one side is constant.
+def spearman(x: np.ndarray, y: np.ndarray, *, constant: float = 0.0) -> float:
+    """Spearman's rank correlation of the pairs that are both there.
+
+    Args:
+        x: ``[E]``, NaN where missing.
+        y: ``[E]``.
+        constant: what it is where one side is constant.
+
+    Returns:
+        The correlation; NaN where values are missing and less than three pairs are left.
 
     Examples:
-        >>> spearman(np.array([1.0, 2.0, 9.0]), np.array([3.0, 2.0, 1.0]))
+        >>> spearman(np.array([1.0, 2.0, 9.0, np.nan]), np.array([3.0, 2.0, 1.0, 0.0]))
         -1.0
     """
-    a, b = (ranks(np.asarray(v)) - (len(v) - 1) / 2 for v in (x, y))
+    there = ~(np.isnan(x) | np.isnan(y))
+    if not there.all() and there.sum() < 3:
+        return float("nan")
+    a, b = (ranks(np.asarray(v)[there]) - (there.sum() - 1) / 2 for v in (x, y))
     size = float(np.sqrt((a * a).sum() * (b * b).sum()))
-    return round(float((a * b).sum()) / size, 12) if size else 0.0
+    return round(float((a * b).sum()) / size, 12) if size else constant
 
 
 def agreement(surprise: np.ndarray, *, resamples: int = 1000, seed: int = 0) -> dict[str, float | None]:
@@ -193,6 +204,23 @@ def judge(
     }
 
 
+def stand_out(mean: np.ndarray, low: np.ndarray) -> np.ndarray:
+    """Episodes whose interval lies above the median by three robust deviations, ``[E]`` bool.
+
+    Args:
+        mean: surprise, ``[E]``.
+        low: lower end of its interval, ``[E]``; NaN where there is none.
+
+    Examples:
+        >>> stand_out(np.array([1.0, 1.1, 0.9, 9.0]), np.array([0.5, 0.6, np.nan, 8.0])).tolist()
+        [False, False, False, True]
+    """
+    if np.isnan(mean).all():
+        return np.zeros(len(mean), dtype=bool)
+    median = np.nanmedian(mean)
+    return low > median + 3 * 1.4826 * np.nanmedian(np.abs(mean - median))
+
+
 def verdict(names: Sequence[str], by_seed: np.ndarray) -> str:
     """One sentence about the episodes that stand out: their whole interval lies above the usual ones.
 
@@ -208,10 +236,9 @@ def verdict(names: Sequence[str], by_seed: np.ndarray) -> str:
     """
     mean = by_seed.mean(0)
     low, _ = interval(by_seed)
-    median = float(np.median(mean))
-    limit = median + 3 * 1.4826 * float(np.median(np.abs(mean - median)))
+    median, marked = float(np.median(mean)), stand_out(mean, low)
     order = np.argsort(-mean, kind="stable")
-    out = [int(e) for e in order if low[e] > limit]
+    out = [int(e) for e in order if marked[e]]
     most = f"{mean[order[0]]:.2f} decades a step, the median is {median:.2f}"
     if not out:
         return (

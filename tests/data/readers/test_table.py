@@ -72,13 +72,13 @@ def test_imitation_has_one_observation_more_an_episode(tmp_path):
 @pytest.mark.parametrize(
     ("change", "error", "message"),
     [
-        ({"actions": None}, KeyError, "nothing in .* is called an action"),
+        ({"actions": None}, KeyError, "has no entries called action: name one by action="),
         ({"observations": None}, KeyError, "nothing in .* is called an observation: name its keys"),
         ({"observations": np.zeros((5, 3))}, ValueError, "'observations' of .* has 5 rows, the action has 6"),
         ({"terminals": np.zeros(5, bool)}, ValueError, "'terminated' of .* has 5 rows, actions 6"),
         ({"actions": np.zeros((0, 2))}, ValueError, "holds no row"),
-        ({"actions": np.array([{}] * 6)}, KeyError, "nothing in .* is called an action"),
-        ({"actions": np.array([["a", "b"]] * 6)}, KeyError, "nothing in .* is called an action"),
+        ({"actions": np.array([{}] * 6)}, KeyError, "has no entries called action: name one by action="),
+        ({"actions": np.array([["a", "b"]] * 6)}, KeyError, "has no entries called action: name one by action="),
         ({"actions": np.full((6, 2), np.nan)}, ValueError, r"data.npz'.*'action' is NaN or infinite in 6 of 6 rows"),
         ({"observations": np.zeros((6, 3), complex)}, KeyError, "nothing in .* is called an observation"),
     ],

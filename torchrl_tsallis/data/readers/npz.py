@@ -61,8 +61,11 @@ class NpzReader(Table):
     def _size(self) -> int:
         wanted = self.options.action
         key = wanted if isinstance(wanted, str) and wanted in self._columns else self._named("action")
-        if key is None:
-            raise KeyError(f"nothing in {str(self.path)!r} is called an action, only {sorted(self._columns)}: name it")
+        if key is None:  # which is an error where it is read; what is there can still be described
+            sizes = [len(self._array(name)) for name, column in self._columns.items() if column.readable]
+            if not sizes:
+                raise KeyError(f"nothing in {str(self.path)!r} is an array of numbers, only {sorted(self._columns)}")
+            return max(sizes, key=sizes.count)
         return len(self._array(key))
 
     @property
