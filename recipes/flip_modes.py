@@ -12,6 +12,7 @@ import csv
 import io
 from dataclasses import replace
 from functools import partial
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -30,17 +31,17 @@ from torchrl_tsallis.jobs import atomic_path, run_jobs, tick
 from torchrl_tsallis.modes import adjusted_rand_index
 from torchrl_tsallis.run import modes
 
-COLUMNS = ("seed", "agreement", "trajectory", "operator", "pages", "mode", "membership", "recommended")
+COLUMNS = ("pair", "seed", "agreement", "trajectory", "operator", "pages", "mode", "membership", "recommended")
 
 
-def record(cfg: DictConfig, seed: int) -> tuple[TensorDict, list[int]]:
+def record(operators: Any, trajectories: int, seed: int) -> tuple[TensorDict, list[int]]:
     """Both operators in turns, ``[2 n 500]``, with who it was under ``operator``; and the pages that each flipped."""
     parts, pages = [], []
-    for episode in range(cfg.trajectories * len(cfg.operators)):
-        who = episode % len(cfg.operators)
+    for episode in range(trajectories * len(operators)):
+        who = episode % len(operators)
         number = 100_000 * (seed + 1) + episode
         drawn = draw_style(np.random.default_rng([number, 1]))
-        style = replace(drawn, **list(cfg.operators.values())[who])
+        style = replace(drawn, **list(operators.values())[who])
         data, facts = record_flips(make_page_flip, seed=number, style=style)
         rows = data.select("observation", "action", "is_init", "next")
         parts.append(
@@ -50,22 +51,24 @@ def record(cfg: DictConfig, seed: int) -> tuple[TensorDict, list[int]]:
     return torch.cat(parts), pages
 
 
-def search(seed: int, cfg: DictConfig) -> None:
-    """Records, finds the modes and writes the rows of one seed, in a process of its own."""
-    file = Path(cfg.output) / f"seed_{seed}.csv"
+def search(job: tuple[str, int], cfg: DictConfig) -> None:
+    """Records, finds the modes and writes the rows of one pair and seed, in a process of its own."""
+    pair, seed = job
+    file = Path(cfg.output) / f"{pair}_{seed}.csv"
     if not file.exists():
-        data, pages = record(cfg, seed)
-        path = Path(cfg.output) / f"demonstrations_{seed}.safetensors"
+        operators = cfg.pairs[pair]
+        data, pages = record(operators, cfg.trajectories, seed)
+        path = Path(cfg.output) / f"{pair}_{seed}.safetensors"
         save_demonstrations(path, data, {"pages": pages})
-        folder = Path(cfg.output) / f"modes_{seed}"
+        folder = Path(cfg.output) / f"{pair}_{seed}"
         found = modes(path, folder, labels="operator", seed=seed, progress=False, overwrite=True, **cfg.search)
         known = [line.rpartition(",")[2] for line in (folder / "labels.csv").read_text().splitlines()[1:]]
-        names, text = list(cfg.operators), io.StringIO()
+        names, text = list(operators), io.StringIO()
         writer = csv.writer(text, lineterminator="\n")
         for k, (who, mode) in enumerate(zip(known, found.mode.tolist(), strict=True)):
             best = int(mode == found.summary["recommended"])
             facts = [f"{found.summary['agreement']:.4f}", k, names[int(who)], pages[k], mode]
-            writer.writerow([seed, *facts, f"{found.membership[k]:.4f}", best])
+            writer.writerow([pair, seed, *facts, f"{found.membership[k]:.4f}", best])
         with atomic_path(file) as temporary:
             temporary.write_text(text.getvalue(), encoding="utf-8")
     tick()
@@ -75,9 +78,12 @@ def report(results: Path) -> str:
     """The table of a raw file, a line a seed."""
     with open(results / "flip_modes.csv", newline="", encoding="utf-8") as file:
         rows: list[dict[str, Any]] = list(csv.DictReader(file))
-    lines = ["| seed | agreement of the starts | modes: episodes of each operator | Rand index |", "|---|---|---|---|"]
-    for seed in sorted({int(row["seed"]) for row in rows}):
-        own = [row for row in rows if int(row["seed"]) == seed]
+    lines = [
+        "| operators differ in | seed | agreement | modes: trajectories of each operator | Rand index |",
+        "|---|---|---|---|---|",
+    ]
+    for pair, seed in dict.fromkeys((row["pair"], row["seed"]) for row in rows):
+        own = [row for row in rows if (row["pair"], row["seed"]) == (pair, seed)]
         names, mode = sorted({row["operator"] for row in own}), torch.tensor([int(row["mode"]) for row in own])
         who = torch.tensor([names.index(row["operator"]) for row in own])
         groups = []
@@ -85,7 +91,7 @@ def report(results: Path) -> str:
             counts = {name: int((who[mode == k] == i).sum()) for i, name in enumerate(names)}
             groups.append(", ".join(f"{count} {name}" for name, count in counts.items() if count))
         index = adjusted_rand_index(mode, who)
-        lines.append(f"| {seed} | {own[0]['agreement']} | {' / '.join(groups)} | {index:.2f} |")
+        lines.append(f"| {pair} | {seed} | {own[0]['agreement']} | {' / '.join(groups)} | {index:.2f} |")
     text = "\n".join(lines)
     with atomic_path(results / "flip_modes.md") as path:
         path.write_text(text + "\n", encoding="utf-8")
@@ -101,10 +107,11 @@ def main(cfg: DictConfig) -> None:
     if cfg.mode == "run":
         cfg.output = str(Path(cfg.output).absolute())
         settings: Any = OmegaConf.to_container(cfg, resolve=True)
-        keep_settings(Path(cfg.output) / "settings.json", settings, ("operators", "trajectories", "search"))
+        keep_settings(Path(cfg.output) / "settings.json", settings, ("pairs", "trajectories", "search"))
+        jobs = list(product(cfg.pairs, cfg.seeds))
         bar = {"desc": "finding modes", "unit": "seed", "progress": cfg.progress, "workers": cfg.workers}
-        run_jobs(partial(search, cfg=cfg), list(cfg.seeds), total=len(cfg.seeds), **bar)
-        parts = [(Path(cfg.output) / f"seed_{seed}.csv").read_text(encoding="utf-8") for seed in cfg.seeds]
+        run_jobs(partial(search, cfg=cfg), jobs, total=len(jobs), **bar)
+        parts = [(Path(cfg.output) / f"{pair}_{seed}.csv").read_text(encoding="utf-8") for pair, seed in jobs]
         with atomic_path(results / "flip_modes.csv") as path:
             path.write_text(",".join(COLUMNS) + "\n" + "".join(parts), encoding="utf-8")
     print(report(results))

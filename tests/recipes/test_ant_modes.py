@@ -69,7 +69,8 @@ def test_two_operators_who_flip_pages_are_recorded_searched_and_compared(run, tm
     small = ["trajectories=3", "seeds=[1]", "search.updates=1", "search.starts=2", "workers=0", "progress=false"]
     run("flip_modes", *small)
     rows = rows_of(tmp_path / "flip_modes" / "flip_modes.csv")
-    assert [row["operator"] for row in rows] == ["calm", "quick"] * 3
+    assert [row["operator"] for row in rows] == ["calm", "quick"] * 6
+    assert [row["pair"] for row in rows] == ["speed_and_height"] * 6 + ["all_habits"] * 6
     assert all(int(row["pages"]) > 0 for row in rows)
     assert "calm" in (tmp_path / "flip_modes" / "flip_modes.md").read_text()
     assert "Rand index" in capsys.readouterr().out
