@@ -156,13 +156,27 @@ def test_what_cannot_be_logged_is_refused_before_anything_is_done(
         assert not (tmp_path / "new").exists() and (ratings / "report.html").stat().st_mtime_ns == page
 
 
-def test_a_rating_that_cannot_be_logged_is_kept_and_said(file, capsys, tmp_path):
+def test_a_folder_of_logs_that_cannot_be_is_refused_before_anything_is_done(file, capsys, tmp_path):
     pytest.importorskip("tensorboard")
     (tmp_path / "file").write_text("")
-    words = ("--train.steps", "20", "--json", "--log", "tensorboard", "--log-dir", tmp_path / "file")
+    for place in (tmp_path / "file", tmp_path / "file" / "below"):
+        words = ("--log", "tensorboard", "--log-dir", place)
+        code, out, err = call(capsys, "rate", file, "--out", tmp_path / "new", *words)
+        assert code == 1 and not out and "nothing can be written under" in err and err.count("\n") == 1
+    assert not (tmp_path / "new").exists()
+
+
+def test_a_rating_that_cannot_be_logged_is_kept_and_said(file, capsys, tmp_path, monkeypatch):
+    pytest.importorskip("tensorboard")
+
+    def full(*args):
+        raise OSError("the disk of 'logs' is full")
+
+    monkeypatch.setattr("torchrl_tsallis.report.log_ratings", full)
+    words = ("--train.steps", "20", "--json", "--log", "tensorboard")
     code, out, err = call(capsys, "rate", file, "--out", tmp_path / "new", *words)
     assert code == 1 and json.loads(out)["logs"] is None and (tmp_path / "new" / "ratings.csv").exists()
-    assert "nothing logged" in err and str(tmp_path / "file") in err and err.count("\n") == 1
+    assert "nothing logged" in err and "disk of 'logs' is full" in err and err.count("\n") == 1
 
 
 def test_modes_become_a_copy_and_a_policy(file, capsys, tmp_path):
@@ -175,7 +189,9 @@ def test_modes_become_a_copy_and_a_policy(file, capsys, tmp_path):
     assert not code and len(json.loads(out)["kept"]) == answer["modes"][best]["episodes"]
     code, out, _ = call(capsys, "info", tmp_path / "copy.npz")
     assert not code and "NaN" not in out
-    options = ["--mode", best, "--out", tmp_path / "policy", "--train.steps", "10", "--json"]
-    assert not call(capsys, "train", tmp_path / "modes", *options)[0]
+    for mode, place in ((best, "policy"), ("each", "told")):
+        options = ["--mode", mode, "--out", tmp_path / place, "--train.steps", "10", "--json"]
+        assert not call(capsys, "train", tmp_path / "modes", *options)[0]
+    assert (tmp_path / "modes" / "modes.html").exists()
     code, _, err = call(capsys, "train", tmp_path / "modes", "--mode", "77", "--out", tmp_path / "other")
     assert code == 1 and "mode=77 is none of those" in err and not (tmp_path / "other").exists()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import json
+import os
 import shlex
 import sys
 from collections.abc import Sequence
@@ -76,6 +77,7 @@ class Logs:
 
         Raises:
             ImportError: if the logger's package is not installed.
+            OSError: if the folder, or the one that it would be made in, cannot be written.
             ValueError: if there is a folder, and nothing to write to it.
         """
         if self.log is None and self.log_dir is not None:
@@ -84,6 +86,11 @@ class Logs:
             )
         if self.log is not None and importlib.util.find_spec(self.log) is None:
             raise ImportError(f"--log {self.log} needs {self.log}: pip install {self.log}")
+        if self.log_dir is not None:
+            place = self.log_dir.expanduser().absolute()
+            there = next(folder for folder in (place, *place.parents) if folder.exists())
+            if not there.is_dir() or not os.access(there, os.W_OK | os.X_OK):
+                raise OSError(f"nothing can be written under {str(there)!r}: choose another --log-dir")
 
     def send(self, folder: Path) -> Path | None:
         """Logs the ratings in a folder; returns where that was written, None without ``--log``."""

@@ -12,12 +12,12 @@ limit                         value      the ratings are not usable if
 :data:`NEAR_ONE`              0.9        ... all but one in a thousand of their ratings are above
 ============================  =========  =================================================================
 
-All of them are conventions: half of a perfect agreement, errors three times as large as expected (9 in squares), and a wide
-range about the 10 % that a calibrated surprise has. They ask whether the ratings repeat and fit, not whether they are
-right, and were validated on no real data with known faults. On 16 simulated sets of data (benchmarks/verdict_limits.py)
-they refuse the two whose actions do not depend on the state, and name no episode in the two clean ones; of the twelve
-with corrupted episodes, all of which have these first, they refuse seven for their stretch: they err towards no
-verdict.
+All of them are conventions: half of a perfect agreement, errors three times as large as expected (9 in squares), and a
+wide range about the 10 % that a calibrated surprise has. They ask whether the ratings repeat and fit, not whether they
+are right, and were validated on no real data with known faults. On 16 simulated sets of data
+(benchmarks/verdict_limits.py) they refuse the two whose actions do not depend on the state, and name no episode in the
+two clean ones; of the twelve with corrupted episodes, all of which have these first, they refuse two for their stretch
+(seven with a limit of 4).
 """
 
 from __future__ import annotations
