@@ -26,6 +26,7 @@ from ant_common import demonstrations, ratings_file, task_data
 from ant_sweep import of_condition, run
 from ant_units import Key
 from collect_flip import collect_flips
+from curation_paper import rate_by_paper, save, scores_of
 from curation_report import COLUMNS, read_rows, report, write_rows
 from curation_scores import of_human, of_labels, rated
 from omegaconf import DictConfig
@@ -33,7 +34,7 @@ from options import check_options, check_parts, check_text, listed, one_seed, sh
 from regimes_report import save_raw
 from torchrl import torchrl_logger
 
-from torchrl_tsallis.jobs import atomic_path, run_jobs, tick
+from torchrl_tsallis.jobs import run_jobs, tick
 
 Cell = tuple[str, float, int]  # task, std, seed
 FLIPS = "page_flip"
@@ -67,12 +68,6 @@ def rate_cell(cell: Cell, cfg: DictConfig) -> None:
     tick()
 
 
-def save(file: Path, arrays: dict[str, Any]) -> None:
-    """Writes scores and labels, atomically."""
-    with atomic_path(file) as path, open(path, "wb") as stream:
-        np.savez_compressed(stream, **arrays)
-
-
 def rate_file(item: tuple[str, str, int], cfg: DictConfig) -> None:
     """Rates the demonstrations of a file with rewards by one seed."""
     from torchrl_tsallis.runs.source import load_source
@@ -97,7 +92,8 @@ def cells_of(grid: Any) -> list[Cell]:
 
 def detect(cfg: DictConfig) -> list[dict[str, Any]]:
     """Rates everything that is asked for; rows of the scores' qualities."""
-    cells = list(dict.fromkeys(cells_of(cfg) + (cells_of(cfg.curated) if cfg.curated is not None else [])))
+    asked = cells_of(cfg)
+    cells = list(dict.fromkeys(asked + (cells_of(cfg.curated) if cfg.curated is not None else [])))
     for std in dict.fromkeys(std for _, std, _ in cells):  # the data is recorded once, not by each worker
         demonstrations(of_condition(cfg, Key("", "", std, 0)), cfg.progress)
     if cfg.flips is not None:
@@ -105,11 +101,14 @@ def detect(cfg: DictConfig) -> list[dict[str, Any]]:
         cells += [(FLIPS, 0.0, seed) for seed in cfg.seeds]
     bar = {"desc": "rating", "unit": "seed", "progress": cfg.progress, "workers": cfg.workers}
     run_jobs(partial(rate_cell, cfg=cfg), cells, total=len(cells), **bar)
+    if cfg.paper:
+        bar |= {"desc": "rating by the paper's methods"}
+        run_jobs(partial(rate_by_paper, cfg=cfg), asked, total=len(asked), **bar)
     files = [(name, path, seed) for name, path in (cfg.human or {}).items() for seed in cfg.seeds]
     run_jobs(partial(rate_file, cfg=cfg), files, total=len(files), **bar)
     rows = []
     for task, std, seed in cells:
-        scores = dict(np.load(ratings_file(cfg, task, std, seed)))
+        scores = scores_of((task, std, seed), cfg)
         rows += [{"data": task, "std": std, "seed": seed, **row} for row in of_labels(scores)]
     for name, _, seed in files:
         scores = dict(np.load(ratings_file(cfg, name, 0.0, seed)))

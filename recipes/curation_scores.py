@@ -58,7 +58,8 @@ def rated(data: Any, *, seed: int, folds: int, steps: int | None) -> dict[str, n
 
 def _episode_scores(scores: Mapping[str, np.ndarray]) -> Iterator[tuple[str, np.ndarray]]:
     named = {"surprise", "surprise_seen", "rejection", "knn_residual", "deminf", "jerk", "still_share"}
-    for name in (*sorted(named), "unusual_path_length", "unusual_steps"):
+    paper = [name for name in scores if name.startswith("rejection_")]
+    for name in (*sorted(named), *paper, "unusual_path_length", "unusual_steps"):
         yield name, scores[name]
 
 
@@ -70,7 +71,8 @@ def of_labels(scores: Mapping[str, np.ndarray]) -> list[dict[str, Any]]:
         bad = np.asarray(scores.get(label, False)).astype(bool)
         if not bad.any():
             continue
-        for name in SAMPLES:
+        of_samples = [name.removeprefix("samples/") for name in scores if name.startswith("samples/rejection_")]
+        for name in (*SAMPLES, *of_samples):
             value = scores[f"samples/{name}"]
             rows.append({"score": name, "label": label, "level": "sample", "auroc": auroc(value[bad], value[~bad])})
         episodes = bad.reshape(count, -1)

@@ -91,6 +91,7 @@ def device(name: str, value: Any) -> None:
 OPTIONS: dict[str, Check] = {
     "output": check_path, "pictures": check_path, "results": check_path, "known": optional(check_path),
     "whole": check_path, "flips": optional(check_path), "human": optional(by_name(check_path)),
+    "paper": optional(listed(check_text)),
     "progress": check_flag, "resume": check_flag, "video": check_flag, "replay": check_flag,
     "workers": partial(check_number, low=0, high=10_000, integer=True),
     "log": choice("csv", "tensorboard", "wandb"), "mode": choice("run", "report"),
