@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
+import sys
+from pathlib import Path
+
 from torchrl_tsallis.version import __version__
+
+sys.path.insert(0, str(Path(__file__).parent / "extensions"))
 
 project = "torchrl-tsallis"
 author = "The torchrl-tsallis authors"
@@ -11,11 +16,13 @@ extensions = [
     "sphinx.ext.autodoc",
     "sphinx.ext.autosummary",
     "sphinx.ext.napoleon",
-    "sphinx.ext.mathjax",
     "sphinx.ext.viewcode",
     "myst_parser",
+    "sphinx_design",
+    "mathml",
 ]
-myst_enable_extensions = ["dollarmath", "amsmath"]
+html_math_renderer = "mathml"
+myst_enable_extensions = ["dollarmath", "amsmath", "colon_fence"]
 myst_heading_anchors = 3
 autodoc_typehints = "none"
 autodoc_default_options = {"members": True}
@@ -25,3 +32,5 @@ suppress_warnings = ["ref.python"]
 exclude_patterns = ["_build"]
 html_theme = "furo"
 html_title = "torchrl-tsallis"
+html_static_path = ["static"]
+html_css_files = ["pages.css"]
