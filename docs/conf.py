@@ -11,6 +11,7 @@ sys.path.insert(0, str(Path(__file__).parent / "extensions"))
 
 project = "torchrl-tsallis"
 author = "The torchrl-tsallis authors"
+copyright = "2026 The torchrl-tsallis authors"
 release = __version__
 extensions = [
     "sphinx.ext.autodoc",
@@ -29,7 +30,7 @@ autodoc_default_options = {"members": True}
 napoleon_custom_sections = [("Keyword Args", "params_style")]
 # keys and parameters of the same name belong to several classes
 suppress_warnings = ["ref.python"]
-exclude_patterns = ["_build"]
+exclude_patterns = ["_build", "results"]  # tables of results are included by the pages that speak of them
 html_theme = "furo"
 html_title = "torchrl-tsallis"
 html_static_path = ["static"]
