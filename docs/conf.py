@@ -21,6 +21,7 @@ extensions = [
     "myst_parser",
     "sphinx_design",
     "mathml",
+    "aliases",
 ]
 html_math_renderer = "mathml"
 myst_enable_extensions = ["dollarmath", "amsmath", "colon_fence"]

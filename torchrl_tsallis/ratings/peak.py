@@ -147,7 +147,7 @@ class PeakRating(Rating):
 
     @property
     def variance_share(self) -> Tensor:
-        """See :attr:`Rating.variance_share`: 1 - u."""
+        """1 - u, see :attr:`Rating.variance_share`."""
         return 1 - self.u
 
     def tuner(self) -> type[Any]:
