@@ -37,7 +37,7 @@ def log_peak(dist: Distribution) -> Tensor:
         dist: batch shape ``[*B]``.
 
     Returns:
-        The log-density at the mode.
+        The log-density at the peak.
 
     Raises:
         NotImplementedError: if the distribution knows no mode.
