@@ -14,7 +14,6 @@ test: install
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest
-	$(BIN)/python -m sphinx -W -q -b html docs docs/_build/html
 
 install: $(VENV)/installed
 

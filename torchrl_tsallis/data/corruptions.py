@@ -210,8 +210,8 @@ def replace_pairs(experts: TensorDictBase, others: TensorDictBase, *, share: flo
         seed: of the choice.
 
     Returns:
-        A copy in which ``("info", "is_amateur")`` is set where a pair was replaced. It is a set of pairs: an episode
-        holds observations of several now.
+        A copy in which ``("info", "is_amateur")`` is set where a pair was replaced. It is a set of pairs, since an
+        episode holds observations of several now.
 
     Raises:
         ValueError: if the share is not in [0, 1].

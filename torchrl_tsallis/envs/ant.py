@@ -38,7 +38,7 @@ def make_ant(render_mode: str | None = None) -> gymnasium.Env:
             window.
 
     Returns:
-        The :class:`~torchrl_tsallis.envs.ant_env.AntEnv`: 28 observations, 8
+        The :class:`~torchrl_tsallis.envs.ant_env.AntEnv` with 28 observations, 8
         torques in [-1, 1], truncated after 1000 steps.
     """
     import gymnasium

@@ -32,7 +32,7 @@ class FlipCount:
 
     @property
     def total(self) -> int:
-        """Flipped pages: a double counts as two."""
+        """Flipped pages; a double counts as two."""
         return len(self.pages)
 
     @property

@@ -168,7 +168,7 @@ def make_page_flip(render_mode: str | None = None) -> gymnasium.Env:
         render_mode: ``None``, or ``"rgb_array"`` for images.
 
     Returns:
-        The environment: 12 observations, 3 forces in [-3.3, 3.3] N, truncated after 500 steps of 20 ms.
+        The environment with 12 observations, 3 forces in [-3.3, 3.3] N, truncated after 500 steps of 20 ms.
     """
     import gymnasium
 

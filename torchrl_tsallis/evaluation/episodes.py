@@ -13,7 +13,7 @@ from torchrl_tsallis.evaluation.interface import ActionRule, begin, is_structure
 from torchrl_tsallis.evaluation.ownership import Policy, act, left_as_found, own_copy
 
 EnvFn = str | Callable[..., Any]
-#: Longest episode, unless another one is asked for: an environment without a limit of its own would never end.
+#: Longest episode, unless another one is asked for; an environment without a limit of its own would never end.
 MAX_STEPS = 10_000
 
 

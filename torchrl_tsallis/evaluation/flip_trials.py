@@ -33,7 +33,7 @@ class FlipTrial:
 
     @property
     def row(self) -> dict[str, int]:
-        """The counts: flipped ``pages``, their ``events``, ``singles``, ``multiples``, the ``run``, and ``success``."""
+        """Counts of flipped ``pages``, their ``events``, ``singles``, ``multiples``, the ``run``, and ``success``."""
         run = longest_single_run(self.flips.sizes)
         return {
             "flips": self.flips.total,

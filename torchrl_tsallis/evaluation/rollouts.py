@@ -26,7 +26,7 @@ from torchrl_tsallis.evaluation.settings import whole_number
 from torchrl_tsallis.jobs import WorkerDiedError, finished_jobs
 
 Task = tuple[str, int]
-#: Most episodes that a worker steps in turn: fewer batch the policy less, more crowd the processor's caches.
+#: Most episodes that a worker steps in turn; fewer batch the policy less, more crowd the processor's caches.
 GROUP = 4
 _WORKER: dict[str, Any] = {}
 _LOGGER = logging.getLogger(__name__)

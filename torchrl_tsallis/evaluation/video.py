@@ -35,7 +35,7 @@ def record_rollout(
     """Records the start of an episode as ``.gif`` (needs pillow) or ``.mp4`` (needs imageio-ffmpeg).
 
     The episode is the one that :func:`~torchrl_tsallis.evaluation.evaluate_policies` runs with this seed, and the
-    policy's mode and memory and the random numbers are left as they were, as there. The video has the size that the
+    policy's mode and memory and the random numbers are left as they were. The video has the size that the
     environment renders; ``.mp4`` repeats the last column or row of an odd one, because H.264 needs an even size.
 
     Args:

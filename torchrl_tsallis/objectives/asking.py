@@ -168,7 +168,7 @@ class AskedLoss:
 
         Args:
             tensordict: as for :meth:`rating`.
-            chunk_size: as there.
+            chunk_size: as for :meth:`rating`.
 
         Returns:
             The surprise, ``[*B]``, not negative; NaN for samples that a mask leaves out.

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 from torch.distributions import Distribution, Independent, Normal, TransformedDistribution, constraints
 
-#: Squared distances are cut here: their squares still fit in float32.
+#: Squared distances are cut here, so that their squares still fit in float32.
 MAX_DISTANCE = 1e9
 
 
@@ -124,7 +124,7 @@ def surprise_of(distance: Tensor, dims: int, variance_share: Tensor) -> Tensor:
         variance_share: c, that broadcasts.
 
     Returns:
-        The surprise, ``[*B]``: 0 at the mean, 2 for one sample in a hundred, 6 for one in a million.
+        The surprise, ``[*B]``, which is 0 at the mean, 2 for one sample in a hundred, 6 for one in a million.
 
     Examples:
         >>> surprise_of(torch.tensor([0.0, 9.2103, 2000.0]), 2, torch.tensor(1.0))

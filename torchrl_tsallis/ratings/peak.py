@@ -37,7 +37,7 @@ def log_peak(dist: Distribution) -> Tensor:
         dist: batch shape ``[*B]``.
 
     Returns:
-        The log-density at the mode.
+        The log-density at the peak.
 
     Raises:
         NotImplementedError: if the distribution knows no mode.
@@ -147,7 +147,7 @@ class PeakRating(Rating):
 
     @property
     def variance_share(self) -> Tensor:
-        """See :attr:`Rating.variance_share`: 1 - u."""
+        """1 - u, see :attr:`Rating.variance_share`."""
         return 1 - self.u
 
     def tuner(self) -> type[Any]:

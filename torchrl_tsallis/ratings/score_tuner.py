@@ -54,10 +54,10 @@ def score_gradient(distance: Tensor, u: Tensor, dims: float, batch: Batch | None
     .. math:: \frac{d H}{d u} = \mathbb{E}\left[w \{(A + 2) Z - u Z^2\} - w^2 Z^2\right] / A
 
     Args:
-        distance: as there, and so are all the others.
-        u: as there.
-        dims: as there.
-        batch: as there.
+        distance: Z, ``[*B]``; no gradient flows into it.
+        u: rejection, a scalar, or ``[S]`` with members.
+        dims: A, the number of action dimensions.
+        batch: valid samples, members and processes. Default: all samples, members where u is ``[S]``.
 
     Returns:
         H and its derivative, a scalar or ``[S]`` each, without graph.

@@ -10,7 +10,7 @@ import numpy as np
 from torchrl_tsallis.data.ratings_folder import RatingsFolder
 from torchrl_tsallis.report.contents import queue, shown
 
-#: Episodes of a table: W&B shows no more.
+#: Episodes of a table, of which W&B shows no more.
 MOST_ROWS = 10_000
 
 

@@ -168,7 +168,7 @@ class Run:
 
     @property
     def summary(self) -> dict[str, Any]:
-        """``summary.json``: whether the ratings are usable, and the verdict."""
+        """Whether the ratings are usable, and the verdict, from ``summary.json``."""
         file = self._table("summary.json")
         found = read_json(file)
         missing = [name for name in ("usable", "reasons", "agreement", "calibration", "sentence") if name not in found]
@@ -178,10 +178,10 @@ class Run:
 
     @property
     def episodes(self) -> list[dict[str, str]]:
-        """``episodes.csv``: one dictionary an episode, in the order of the data."""
+        """One dictionary an episode, in the order of the data, from ``episodes.csv``."""
         return read_csv(self._table("episodes.csv"), EPISODES, self.settings["data"].get("episodes"))
 
     @property
     def ratings(self) -> list[dict[str, str]]:
-        """``ratings.csv``: one dictionary a row."""
+        """One dictionary a row, from ``ratings.csv``."""
         return read_csv(self._table("ratings.csv"), RATINGS, self.settings["data"].get("steps"))

@@ -114,8 +114,8 @@ def concatenate_observations(
         keys: of the vectors, in the order of the columns. Default: all, sorted.
 
     Returns:
-        A shallow copy, with next observations treated alike where there are any, and the layout: each key with its
-        first column and the one after its last.
+        A shallow copy, with next observations treated alike where there are any, and the layout, which gives each key
+        its first column and the one after its last.
 
     Raises:
         KeyError: if a key is missing.

@@ -94,13 +94,14 @@ def q_gradient(
     the sign of b - 1 is that of :math:`\mathbb{E}[\pi^{1-q} - 1]`, which is computed without cancellation.
 
     Args:
-        log_prob: as there, ``[*B]``; ``[S, *B]`` with members. All others are as there, too.
-        phi: as there.
-        q_min: as there.
-        multiplier: as there.
-        gamma_min: as there, or ``[*S]`` together with the other one. A fixed gamma is one between equal bounds.
-        gamma_max: as there.
-        gamma: as there.
+        log_prob: imitator's log-density, ``[*B]``; ``[S, *B]`` with members.
+        phi: free parameter of q, a scalar, or ``[S]`` with members.
+        q_min: lower bound of q.
+        multiplier: Lagrange multiplier lambda.
+        gamma_min: lower bound of the adaptive gamma, or ``[S]`` together with the upper one. A fixed gamma is one
+            between equal bounds.
+        gamma_max: upper bound of the adaptive gamma.
+        gamma: a fixed gamma instead of the adaptive one.
         batch: valid samples, members and processes. Default: all samples, members where phi is ``[S]``.
 
     Returns:
