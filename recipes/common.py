@@ -159,6 +159,7 @@ def save_as_run(
         kind="recipe",
         actor=actor.state_dict(),
         rating=loss.rating_module.state_dict(),
+        rating_class=type(loss.rating_module),
         arguments={**sizes, "hidden": list(cfg.policy.hidden)},
         data={"path": "", "format": "memory", "keys": keys, "identity": identity(data), "steps": len(data), **about},
         train={"epochs": cfg.epochs, "batch_size": cfg.batch_size, "seed": seed, "lr": cfg.optimizer.lr},

@@ -226,6 +226,7 @@ def _write_policy(
         kind=kind,
         actor=members.actor_state(member),
         rating=members.rating_state(member),
+        rating_class=type(members.loss.rating_module),
         arguments={"obs_dim": obs_dim, "action_dim": action_dim},
         data=source.to_json(),
         train=numbers,

@@ -67,6 +67,16 @@ def test_the_page_says_what_was_found_loads_nothing_and_is_written_beside_a_pict
     assert text.count("<svg") == 2 + (len(large) * (len(large) - 1) // 2 if len(large) < 4 else 3)
 
 
+def test_a_folder_with_its_page_may_be_replaced_and_one_with_more_may_not(tmp_path):
+    searched(tmp_path / "modes", components=2, labels="operator")
+    write_modes_report(tmp_path / "modes")
+    searched(tmp_path / "modes")
+    assert not (tmp_path / "modes" / "labels.csv").exists()
+    (tmp_path / "modes" / "thesis.tex").write_text("")
+    with pytest.raises(FileExistsError, match="holds more than a run .thesis.tex.: move that first"):
+        searched(tmp_path / "modes")
+
+
 def test_the_page_of_one_mode_compares_nothing(tmp_path):
     searched(tmp_path / "modes")
     text = write_modes_report(tmp_path / "modes").read_text()

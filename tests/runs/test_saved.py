@@ -8,6 +8,7 @@ from tensordict import TensorDict
 
 from torchrl_tsallis import CATSoftUpdate, PeakRating, QTuner, TsallisBCLoss, TsallisRating
 from torchrl_tsallis.modules import make_policy
+from torchrl_tsallis.ratings import Rated, Rating
 from torchrl_tsallis.runs import Run
 from torchrl_tsallis.runs.saved import save_run
 
@@ -46,6 +47,7 @@ def save(folder, loss, **changes):
         "kind": "recipe",
         "actor": dict(actor.items()),
         "rating": loss.rating_module.state_dict(),
+        "rating_class": type(loss.rating_module),
         "arguments": {"obs_dim": 3, "action_dim": 2, "hidden": [7]},
         "data": {"format": "memory", "keys": {"observation": ["observation"], "action": ["action"]}},
         "train": {"steps": 20},
@@ -81,8 +83,47 @@ def test_a_target_network_that_is_missing_or_of_another_policy_is_said(tmp_path)
         Run.open(tmp_path).rate(batch)
 
 
-def test_a_rating_that_is_neither_is_refused_before_anything_is_written(tmp_path):
-    loss, _ = trained(RATINGS["peak"](), steps=1)
-    with pytest.raises(ValueError, match="PeakRating and TsallisRating can"):
-        save(tmp_path, loss, rating={"beta": torch.tensor(0.0)})
+class Threshold(Rating):
+    """Takes no sample whose density is under a limit: a rating of a user's own, in one file."""
+
+    def __init__(self, limit=1.0, beta=0.0):
+        super().__init__(beta)
+        self.add_setting("limit", limit, 0, 10)
+
+    def forward(self, evidence):
+        value = -evidence.log_prob.detach()
+        weight = (value < -self.limit.log()).to(value)
+        return Rated(evidence.loss(value, weight), weight, value, {})
+
+
+class Sealed(Threshold):
+    """One that cannot be made again: its setting has another name than the argument."""
+
+    def __init__(self, where):
+        super().__init__(limit=where)
+
+
+def test_a_rating_of_ones_own_is_saved_and_opened_without_a_word_elsewhere(tmp_path):
+    loss, batch = trained(Threshold(limit=0.5))
+    save(tmp_path, loss)
+    run = Run.open(tmp_path)
+    assert run.settings["method"] == {"rating": "Threshold", "limit": 0.5, "beta": 0.0}
+    assert isinstance(run.loss().rating_module, Threshold)
+    torch.testing.assert_close(run.rate(batch), loss.rating(batch), rtol=0, atol=0)
+
+
+def test_a_rating_that_could_not_be_opened_is_refused_before_anything_is_written(tmp_path):
+    loss, _ = trained(Sealed(0.5), steps=1)
+    with pytest.raises(
+        ValueError, match="a Sealed cannot be made again from .*: give it settings_of and from_settings"
+    ):
+        save(tmp_path, loss)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_rating_whose_module_was_not_imported_is_named(tmp_path, monkeypatch):
+    loss, batch = trained(Threshold(), steps=1)
+    save(tmp_path, loss)
+    monkeypatch.delitem(Rating.known, "Threshold")
+    with pytest.raises(ValueError, match="rating 'Threshold' of run.json is not known here, only .*peak.*: import the"):
+        Run.open(tmp_path).rate(batch)

@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from numbers import Real
-from typing import TYPE_CHECKING, Any, NamedTuple
+import inspect
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
-import numpy as np
 import torch
 from torch import Tensor, nn
 from torch.distributions import Distribution
 
-from torchrl_tsallis._checks import shown
 from torchrl_tsallis.ratings.batch import Batch
 from torchrl_tsallis.ratings.normal import diagonal_normal, scale_weighted_log_prob
+from torchrl_tsallis.ratings.numbers import as_numbers
 
 if TYPE_CHECKING:
     from torchrl_tsallis.ratings.tuner import RatingTuner
@@ -116,12 +115,41 @@ class Rating(nn.Module):
         False
     """
 
+    #: What ``run.json`` calls the class. Default: the class's own name.
+    saved_as: ClassVar[str] = ""
+    #: The classes by that, of modules that were imported.
+    known: ClassVar[dict[str, type[Rating]]] = {}
     #: Whether the target network's log-density is needed.
     needs_target: bool = False
     #: Names of what ``forward`` logs, in the order in which the loss returns them.
     logged: tuple[str, ...] = ()
 
     beta: Tensor
+
+    def __init_subclass__(cls, **options: Any) -> None:
+        """Makes the class known to runs that are opened."""
+        super().__init_subclass__(**options)
+        cls.saved_as = cls.__dict__.get("saved_as") or cls.__name__
+        Rating.known[cls.saved_as] = cls
+
+    @classmethod
+    def settings_of(cls, state: Mapping[str, Tensor]) -> dict[str, Any]:
+        """Settings of a rating of one policy by its state, as ``run.json`` says them and :meth:`from_settings` reads.
+
+        Default: the constructor's arguments that are scalars of the state.
+
+        Examples:
+            >>> from torchrl_tsallis import PeakRating
+            >>> PeakRating.settings_of(PeakRating(u=0.25).state_dict())
+            {'u': 0.25, 'beta': 0.5}
+        """
+        names = [name for name in inspect.signature(cls).parameters if name in state and state[name].ndim == 0]
+        return {name: float(state[name]) for name in names}
+
+    @classmethod
+    def from_settings(cls, settings: Mapping[str, Any]) -> Rating:
+        """A rating with such settings, whose running statistics are at their start."""
+        return cls(**settings)
 
     def __init__(self, beta: float | Sequence[float] = 0.0) -> None:
         super().__init__()
@@ -223,43 +251,3 @@ class Rating(nn.Module):
             Loss and rating of each sample, and what is logged.
         """
         raise NotImplementedError
-
-
-def _within(x: Any, low: float, high: float) -> bool:
-    """Whether a number is in [low, high]; integers beyond the floats are compared as they are."""
-    return low <= x <= high
-
-
-def as_numbers(name: str, value: Any, low: float, high: float) -> float | list[float]:
-    """A setting as a number in [low, high], or a list of them.
-
-    Args:
-        name: for the message.
-        value: a number, or a sequence or tensor of numbers.
-        low: the least that is allowed.
-        high: the largest that is allowed.
-
-    Returns:
-        A float, or a list of floats.
-
-    Raises:
-        ValueError: for anything else, NaN included.
-
-    Examples:
-        >>> as_numbers("q", [1, 0.5], 0, 1)
-        [1.0, 0.5]
-        >>> as_numbers("q", None, 0, 1)
-        Traceback (most recent call last):
-        ...
-        ValueError: q must be a number in [0, 1], or a sequence of one for each stacked member, got None
-    """
-    plain: Any = value.tolist() if isinstance(value, (Tensor, np.ndarray)) else value
-    many = isinstance(plain, Sequence) and not isinstance(plain, str)
-    numbers: list[Any] = list(plain) if many else [plain]
-    valid = [isinstance(x, Real) and not isinstance(x, bool) and _within(x, low, high) for x in numbers]
-    if numbers and all(valid):
-        return [float(x) for x in numbers] if many else float(plain)
-    raise ValueError(
-        f"{name} must be a number in [{low:g}, {high:g}], or a sequence of one for each stacked member, got "
-        f"{shown(value)}"
-    )

@@ -129,6 +129,7 @@ class PeakRating(Rating):
         False
     """
 
+    saved_as = "peak"
     logged = ("u", "distance")
 
     u: Tensor

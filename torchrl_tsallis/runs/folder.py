@@ -19,8 +19,10 @@ from torchrl_tsallis.jobs.files import atomic_path, disk_errors
 #: The file that makes a folder a run, and the format that this package writes.
 RUN, FORMAT = "run.json", 1
 #: What a run, its report and its card consist of; pictures and logs are recognised by their endings.
-FILES = (RUN, "policy.safetensors", "rating.safetensors", "target.safetensors", "scaling.json", "pairs.safetensors")
-TABLES = ("ratings.csv", "episodes.csv", "modes.csv", "summary.json")
+FILES = (RUN, "policy.safetensors", "rating.safetensors", "target.safetensors", "scaling.json")
+TABLES = ("ratings.csv", "episodes.csv", "summary.json")
+#: What a search for modes leaves beside run.json and summary.json.
+OF_MODES = ("modes.csv", "labels.csv", "differences.csv", "pairs.safetensors", "modes.html")
 _OTHERS, _ENDINGS = ("report.html", "README.md"), (".png", ".svg")
 
 
@@ -50,7 +52,7 @@ def check_free(out: str | os.PathLike[str], overwrite: bool, source: str | os.Pa
         raise FileExistsError(
             f"{str(place)!r} holds a run: choose another output folder, or replace it (overwrite=True, --overwrite)"
         )
-    known = {*FILES, *TABLES, *_OTHERS}
+    known = {*FILES, *TABLES, *OF_MODES, *_OTHERS}
     others = sorted(x.name for x in place.iterdir() if x.name not in known and x.suffix not in _ENDINGS)
     if others:
         raise FileExistsError(f"{str(place)!r} holds more than a run ({', '.join(others[:3])}): move that first")

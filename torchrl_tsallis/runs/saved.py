@@ -20,8 +20,6 @@ from torch import Tensor
 from torchrl_tsallis.data.robust_scaling import RobustScaling
 from torchrl_tsallis.jobs.files import atomic_path
 from torchrl_tsallis.ratings.base import Rating
-from torchrl_tsallis.ratings.peak import PeakRating
-from torchrl_tsallis.ratings.tsallis.rating import TsallisRating
 from torchrl_tsallis.runs.folder import FORMAT, RUN, read_json, write_json
 from torchrl_tsallis.version import __version__
 
@@ -31,7 +29,6 @@ FACTORY = "torchrl_tsallis.modules.make_policy"
 _NEEDED: dict[tuple[str, ...], type | tuple[type, ...]] = {
     ("kind",): str,
     ("method", "rating"): str,
-    ("method", "beta"): (int, float),
     ("policy", "factory"): str,
     ("policy", "arguments", "obs_dim"): int,
     ("policy", "arguments", "action_dim"): int,
@@ -72,41 +69,23 @@ def load_tensors(path: Path) -> dict[str, Tensor]:
         raise ValueError(f"{str(path)!r} is broken ({error}): make the run again") from error
 
 
-def describe_rating(state: Mapping[str, Tensor]) -> dict[str, Any]:
-    """Settings of a rating of one policy, from its state, for ``run.json``.
-
-    Raises:
-        ValueError: if it is neither a peak rating nor Tsallis's.
-
-    Examples:
-        >>> describe_rating(TsallisRating(q=0.75, gamma_mix=0.0).state_dict())
-        {'rating': 'tsallis', 'q': 0.75, 'gamma': [0.0, 0.0], 'beta': 0.0}
-    """
-    number = {name: float(value) for name, value in state.items() if value.ndim == 0}
-    if "u" in number:
-        return {"rating": "peak", "u": number["u"], "beta": number["beta"]}
-    if "gamma_low" in number:
-        gamma = [number["gamma_low"], number["gamma_high"]]
-        return {"rating": "tsallis", "q": number["q"], "gamma": gamma, "beta": number["beta"]}
-    raise ValueError(f"a rating with the state {sorted(state)} cannot be saved: PeakRating and TsallisRating can")
-
-
 def make_rating(method: Mapping[str, Any]) -> Rating:
-    """The rating that :func:`describe_rating` described; its running statistics are at their start.
+    """The rating that ``method`` of ``run.json`` describes; its running statistics are at their start.
 
     Raises:
-        ValueError: if it is none that is known.
+        ValueError: if it is none that is known; a module of one's own has to be imported first.
     """
+    settings = dict(method)
+    kind = Rating.known.get(str(settings.pop("rating", None)))
+    if kind is None:
+        raise ValueError(
+            f"the rating {method.get('rating')!r} of {RUN} is not known here, only {', '.join(sorted(Rating.known))}: "
+            "import the module of its class first"
+        )
     try:
-        if method["rating"] == "peak":
-            return PeakRating(u=method["u"], beta=method["beta"])
-        if method["rating"] == "tsallis":
-            low, high = method["gamma"]
-            bounds = {"gamma_min": low, "gamma_max": high} if low < high else {"gamma_mix": low}
-            return TsallisRating(q=method["q"], beta=method["beta"], **bounds)
+        return kind.from_settings(settings)
     except (KeyError, TypeError, ValueError) as error:
         raise ValueError(f"the method {dict(method)} of {RUN} describes no rating ({error})") from error
-    raise ValueError(f"the rating {method['rating']!r} of {RUN} is not known here")
 
 
 def save_run(
@@ -115,6 +94,7 @@ def save_run(
     kind: str,
     actor: Mapping[str, Tensor],
     rating: Mapping[str, Tensor],
+    rating_class: type[Rating],
     arguments: Mapping[str, Any],
     data: Mapping[str, Any],
     train: Mapping[str, Any],
@@ -129,6 +109,7 @@ def save_run(
         kind: ``"ratings"``, ``"policy"`` or ``"recipe"``.
         actor: state of an actor of :func:`~torchrl_tsallis.modules.make_policy`.
         rating: state of its rating, of one policy.
+        rating_class: its class.
         arguments: of ``make_policy``.
         data: ``format`` and ``keys`` of what it was trained on, and whatever else identifies it.
         train: numbers of the training.
@@ -141,10 +122,17 @@ def save_run(
 
     Raises:
         OSError: if a file cannot be written.
-        ValueError: if the rating cannot be described.
+        ValueError: if the rating cannot be made again from its state.
     """
     place = Path(folder)
-    method = describe_rating(rating)
+    method = {"rating": rating_class.saved_as, **rating_class.settings_of(rating)}
+    try:
+        make_rating(method)
+    except ValueError as error:
+        raise ValueError(
+            f"a {rating_class.__name__} cannot be made again from {method}, so that its run could not be opened: give "
+            "it settings_of and from_settings"
+        ) from error
     save_tensors(place / "rating.safetensors", rating)
     if target is not None:
         save_tensors(place / "target.safetensors", target)

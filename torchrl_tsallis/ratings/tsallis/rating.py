@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, Literal
 
 import numpy as np
@@ -10,7 +10,8 @@ import torch
 from torch import Tensor
 
 from torchrl_tsallis._checks import shown
-from torchrl_tsallis.ratings.base import Evidence, Rated, Rating, as_numbers
+from torchrl_tsallis.ratings.base import Evidence, Rated, Rating
+from torchrl_tsallis.ratings.numbers import as_numbers
 from torchrl_tsallis.ratings.running import RunningMean
 from torchrl_tsallis.ratings.tsallis.equations import adaptive_gamma, bound_ratio, log_mixture, rated_value, rating
 
@@ -58,6 +59,7 @@ class TsallisRating(Rating):
         (False, True)
     """
 
+    saved_as = "tsallis"
     logged = ("q", "gamma_mix", "bound")
 
     q: Tensor
@@ -82,6 +84,24 @@ class TsallisRating(Rating):
         self.add_setting("gamma_high", _levels(gamma_mix, gamma_max), 0, 1, argument="gamma_mix")
         self.moment = RunningMean()
         self._sort_members()
+
+    @classmethod
+    def settings_of(cls, state: Mapping[str, Tensor]) -> dict[str, Any]:
+        """See :meth:`Rating.settings_of`; ``gamma`` are the two bounds of the level.
+
+        Examples:
+            >>> TsallisRating.settings_of(TsallisRating(q=0.75, gamma_mix=0.0).state_dict())
+            {'q': 0.75, 'gamma': [0.0, 0.0], 'beta': 0.0}
+        """
+        q, low, high, beta = (float(state[name]) for name in ("q", "gamma_low", "gamma_high", "beta"))
+        return {"q": q, "gamma": [low, high], "beta": beta}
+
+    @classmethod
+    def from_settings(cls, settings: Mapping[str, Any]) -> TsallisRating:
+        """See :meth:`Rating.from_settings`."""
+        low, high = settings["gamma"]
+        bounds = {"gamma_min": low, "gamma_max": high} if low < high else {"gamma_mix": low}
+        return cls(q=settings["q"], beta=settings["beta"], **bounds)
 
     def _sort_members(self) -> None:
         """Keeps what decides about the course of a batch as Python values: to read a buffer would stall a GPU."""
