@@ -100,6 +100,26 @@ def test_numbers_that_cannot_be_are_refused_by_name(name, value):
         find_modes(data, **{name: value})
 
 
+@pytest.mark.parametrize(
+    ("key", "value", "said"),
+    [
+        ("action", torch.zeros(256, dtype=torch.long), "'action' is no vector of floating-point numbers"),
+        ("observation", torch.zeros(256, 3, 4, 4), "'observation' is no vector of floating-point numbers"),
+        ("action", torch.full((256, 1), float("nan")), "'action' is NaN or infinite in 256 of 256 rows"),
+    ],
+)
+def test_what_a_mixture_cannot_take_is_named(key, value, said):
+    data, _ = demonstrations()
+    with pytest.raises(ValueError, match=said):
+        find_modes(data.set(key, value))
+
+
+def test_a_missing_key_is_named():
+    data, _ = demonstrations()
+    with pytest.raises(KeyError, match="action"):
+        find_modes(data.exclude("action"))
+
+
 def test_too_few_episodes_and_pairs_are_refused_with_the_reason():
     data, _ = demonstrations((2, 2))
     with pytest.raises(ValueError, match="4 episodes are too few to find modes among them: record at least 6"):

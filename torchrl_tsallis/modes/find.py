@@ -7,16 +7,24 @@ from typing import Any
 
 import torch
 from tensordict import TensorDictBase
+from torch import Tensor
 
-from torchrl_tsallis._checks import check_number
+from torchrl_tsallis._checks import check_flag, check_number
+from torchrl_tsallis._device import check_device
 from torchrl_tsallis.data.episodes import find_episodes
 from torchrl_tsallis.data.robust_scaling import RobustScaling
+from torchrl_tsallis.data.schema import check_rows
 from torchrl_tsallis.modes.consensus import together
 from torchrl_tsallis.modes.found import TOGETHER, Modes
 from torchrl_tsallis.modes.train import train_mixtures
 
 #: Updates of the responsibilities.
 UPDATES = 60
+#: Largest seed: others are made of it by sums and products.
+MOST_SEED = 10**12
+#: Most components and starts, each: more would not fit into a program.
+MOST_MEMBERS = 1000
+KEYS = ("observation", "action")
 
 
 def find_modes(
@@ -108,21 +116,28 @@ def find_modes_of_each(
     Raises:
         ValueError: as there, or if there is not a seed a set.
     """
-    numbers = {"components": (components, 2), "starts": (starts, 2), "updates": (updates, 1)}
-    for name, (value, low) in (numbers | {"batch_size": (batch_size, 1)}).items():
-        check_number(name, value, low=low, integer=True)
-    for seed in seeds:
-        check_number("seed", seed, low=0, integer=True)
-    check_number("threshold", threshold, above=0, high=1)
+    components, starts = (int(check_number(name, value, low=2, high=MOST_MEMBERS, integer=True)) for name, value in
+                          (("components", components), ("starts", starts)))  # fmt: skip
+    updates = int(check_number("updates", updates, low=1, integer=True))
+    batch_size = int(check_number("batch_size", batch_size, low=1, integer=True))
+    seeds = [int(check_number("seed", seed, low=0, high=MOST_SEED, integer=True)) for seed in seeds]
+    threshold = check_number("threshold", threshold, above=0, high=1)
+    check_flag("always", always)
+    check_flag("progress", progress)
+    check_device(device)
     if not len(sets) or len(seeds) != len(sets):
         raise ValueError(f"{len(sets)} sets and {len(seeds)} seeds: give one seed a set, and at least one")
     scaled, counts = [], []
     for data in sets:
+        check_rows(data, KEYS)
+        for key in KEYS:
+            if not isinstance(data[key], Tensor) or data[key].ndim != 2 or not data[key].is_floating_point():
+                raise ValueError(f"{key!r} is no vector of floating-point numbers [N, D]: modes are found among those")
         episodes = find_episodes(data, purpose="a search for modes", open_end=True)
         counts.append(len(episodes.starts))
         if counts[-1] < 6:
             raise ValueError(f"{counts[-1]} episodes are too few to find modes among them: record at least 6")
-        rows = data.select("observation", "action")
+        rows = data.select(*KEYS)
         scaled.append(RobustScaling.fit(rows)(rows).set("episode", episodes.of_rows()))
     components = min(components, min(counts) // 3)
     sizes = [components if k % 2 == 0 else max(2, 2 * components // 3) for k in range(starts)]
