@@ -31,12 +31,13 @@ from torchrl_tsallis.jobs import atomic_path, run_jobs, tick
 from torchrl_tsallis.modes import adjusted_rand_index
 from torchrl_tsallis.run import modes
 
-COLUMNS = ("pair", "seed", "agreement", "trajectory", "operator", "pages", "mode", "membership", "recommended")
+COLUMNS = ("pair", "seed", "agreement", "trajectory", "operator", "tremor", "wander", "pages", "mode", "membership",
+           "recommended")  # fmt: skip
 
 
-def record(operators: Any, trajectories: int, seed: int) -> tuple[TensorDict, list[int]]:
-    """Both operators in turns, ``[2 n 500]``, with who it was under ``operator``; and the pages that each flipped."""
-    parts, pages = [], []
+def record(operators: Any, trajectories: int, seed: int) -> tuple[TensorDict, list[tuple[str, str, int]]]:
+    """Both operators in turns, ``[2 n 500]``, with who it was under ``operator``; tremor, wander and pages of each."""
+    parts, habits = [], []
     for episode in range(trajectories * len(operators)):
         who = episode % len(operators)
         number = 100_000 * (seed + 1) + episode
@@ -47,8 +48,8 @@ def record(operators: Any, trajectories: int, seed: int) -> tuple[TensorDict, li
         parts.append(
             rows.set("episode", torch.full((len(rows),), episode)).set("operator", torch.full((len(rows),), who))
         )
-        pages.append(facts["flips"])
-    return torch.cat(parts), pages
+        habits.append((f"{style.tremor:.6f}", f"{style.wander:.6f}", facts["flips"]))
+    return torch.cat(parts), habits
 
 
 def search(job: tuple[str, int], cfg: DictConfig) -> None:
@@ -57,9 +58,9 @@ def search(job: tuple[str, int], cfg: DictConfig) -> None:
     file = Path(cfg.output) / f"{pair}_{seed}.csv"
     if not file.exists():
         operators = cfg.pairs[pair]
-        data, pages = record(operators, cfg.trajectories, seed)
+        data, habits = record(operators, cfg.trajectories, seed)
         path = Path(cfg.output) / f"{pair}_{seed}.safetensors"
-        save_demonstrations(path, data, {"pages": pages})
+        save_demonstrations(path, data, {"pages": [pages for *_, pages in habits]})
         folder = Path(cfg.output) / f"{pair}_{seed}"
         found = modes(path, folder, labels="operator", seed=seed, progress=False, overwrite=True, **cfg.search)
         known = [line.rpartition(",")[2] for line in (folder / "labels.csv").read_text().splitlines()[1:]]
@@ -67,11 +68,19 @@ def search(job: tuple[str, int], cfg: DictConfig) -> None:
         writer = csv.writer(text, lineterminator="\n")
         for k, (who, mode) in enumerate(zip(known, found.mode.tolist(), strict=True)):
             best = int(mode == found.summary["recommended"])
-            facts = [f"{found.summary['agreement']:.4f}", k, names[int(who)], pages[k], mode]
+            facts = [f"{found.summary['agreement']:.4f}", k, names[int(who)], *habits[k], mode]
             writer.writerow([pair, seed, *facts, f"{found.membership[k]:.4f}", best])
         with atomic_path(file) as temporary:
             temporary.write_text(text.getvalue(), encoding="utf-8")
     tick()
+
+
+def explained(values: Any, mode: np.ndarray) -> float:
+    """Share of a habit's variance that modes explain, adjusted for their number: 0 is chance."""
+    value, numbers = np.asarray(values), np.unique(mode)
+    within = sum(((value[mode == k] - value[mode == k].mean()) ** 2).sum() for k in numbers)
+    total = ((value - value.mean()) ** 2).sum()
+    return float(1 - within / total * (len(value) - 1) / max(1, len(value) - len(numbers)))
 
 
 def report(results: Path) -> str:
@@ -90,8 +99,9 @@ def report(results: Path) -> str:
         for k in mode.unique().tolist():
             counts = {name: int((who[mode == k] == i).sum()) for i, name in enumerate(names)}
             groups.append(", ".join(f"{count} {name}" for name, count in counts.items() if count))
-        index = adjusted_rand_index(mode, who)
-        lines.append(f"| {pair} | {seed} | {own[0]['agreement']} | {' / '.join(groups)} | {index:.2f} |")
+        line = [pair, seed, own[0]["agreement"], " / ".join(groups), f"{adjusted_rand_index(mode, who):.2f}"]
+        line += [f"{explained([float(row[name]) for row in own], mode.numpy()):.2f}" for name in ("tremor", "wander")]
+        lines.append(f"| {' | '.join(line)} |")
     text = "\n".join(lines)
     with atomic_path(results / "flip_modes.md") as path:
         path.write_text(text + "\n", encoding="utf-8")
