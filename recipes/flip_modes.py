@@ -87,10 +87,8 @@ def report(results: Path) -> str:
     """The table of a raw file, a line a seed."""
     with open(results / "flip_modes.csv", newline="", encoding="utf-8") as file:
         rows: list[dict[str, Any]] = list(csv.DictReader(file))
-    lines = [
-        "| operators differ in | seed | agreement | modes: trajectories of each operator | Rand index |",
-        "|---|---|---|---|---|",
-    ]
+    names_of = ("operators differ in", "seed", "agreement", "modes", "Rand index", "tremor", "wander")
+    lines = [f"| {' | '.join(names_of)} |", f"|{'---|' * len(names_of)}"]
     for pair, seed in dict.fromkeys((row["pair"], row["seed"]) for row in rows):
         own = [row for row in rows if (row["pair"], row["seed"]) == (pair, seed)]
         names, mode = sorted({row["operator"] for row in own}), torch.tensor([int(row["mode"]) for row in own])
