@@ -50,7 +50,9 @@ def tensorboard_steps(folder: Path) -> list[int]:
     """Of the files as they are: TensorBoard itself would leave out what comes twice."""
     from tensorboard.backend.event_processing.event_file_loader import EventFileLoader
 
-    paths = sorted((folder / "tensorboard" / "run").glob("events.*"))
+    # Names end in the number of the process's file, 9 before 10.
+    number = lambda path: (path.name.split(".")[3], int(path.suffix[1:]))  # noqa: E731
+    paths = sorted((folder / "tensorboard" / "run").glob("events.*"), key=number)
     events = [event for path in paths for event in EventFileLoader(str(path)).Load() if event.HasField("summary")]
     return [event.step for event in events if any(value.tag == "ess" for value in event.summary.value)]
 
