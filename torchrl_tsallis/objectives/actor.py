@@ -19,6 +19,8 @@ from tensordict.utils import NestedKey
 from torch import Tensor, nn
 from torch.distributions import Distribution, Independent, Normal
 
+from torchrl_tsallis.modules.fast import network_of
+
 #: Standardised distances beyond this one are taken for infinite; their fourth power still fits in float32.
 _FAR = 1e9
 
@@ -51,6 +53,49 @@ def _call(network: TensorDictModule, tensors: Sequence[Any]) -> dict[NestedKey, 
     elif not isinstance(out, (tuple, list)):
         out = [out]
     return dict(zip(keys, out, strict=True))
+
+
+def _fast_outputs(
+    actor: ProbabilisticTensorDictSequential,
+    parts: tuple[TensorDictModule, ProbabilisticTensorDictModule] | None,
+    inputs: TensorDictBase,
+    params: TensorDictBase,
+) -> dict[NestedKey, Any] | None:
+    """The network's outputs by key, where it is the paper's; its parameters need not be written into it."""
+    if parts is None or len(parts[0].in_keys) != 1 or len(parts[0].out_keys) != 2:
+        return None
+    network = network_of(actor, parts[0].module)
+    out = None if network is None else network(inputs.get(parts[0].in_keys[0]), params)
+    return None if out is None else dict(zip(parts[0].out_keys, out, strict=True))
+
+
+def get_dist_with(
+    actor: ProbabilisticTensorDictSequential, inputs: TensorDictBase, params: TensorDictBase
+) -> Distribution:
+    """:func:`get_dist` of an actor with other parameters.
+
+    Args:
+        actor: stochastic actor.
+        inputs: with the actor's input keys, ``[*B]``.
+        params: parameters of the actor, such as those of its target network.
+
+    Returns:
+        The distribution of the action, batch shape ``[*B]``.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl_tsallis.modules import make_policy
+        >>> actor, data = make_policy(3, 2), TensorDict({"observation": torch.zeros(5, 3)}, [5])
+        >>> get_dist_with(actor, data, TensorDict.from_module(actor) * 0).mean[0]
+        tensor([0., 0.])
+    """
+    parts = _network_and_head(actor)
+    fast = _fast_outputs(actor, parts, inputs, params)
+    if parts is not None and fast is not None:
+        return parts[1].get_dist(fast)
+    with params.to_module(actor, preserve_module_state=False):
+        return get_dist(actor, inputs)
 
 
 def get_dist(actor: ProbabilisticTensorDictSequential, inputs: TensorDictBase) -> Distribution:
@@ -151,6 +196,9 @@ def get_stacked_dist(
     if actor.return_composite:
         raise NotImplementedError("stacked members need an actor with one distribution (return_composite=False)")
 
+    fast = _fast_outputs(actor, parts, inputs, params)
+    if parts is not None and fast is not None:
+        return parts[1].get_dist(fast)
     if parts is not None and _is_stackable(parts[0].module):
         with params.to_module(actor, preserve_module_state=False), named_inputs(actor, inputs):
             return parts[1].get_dist(_call(parts[0], [inputs.get(key) for key in parts[0].in_keys]))
