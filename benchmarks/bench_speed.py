@@ -198,6 +198,9 @@ def target_group(args: argparse.Namespace) -> Contenders:
     for what, name in [("SoftUpdate", "torch"), *(("CATSoftUpdate", name) for name in variants(args.kernels))]:
         loss = TsallisBCLoss([make_policy(OBSERVATION, ACTION) for _ in range(args.members)])
         updater = SoftUpdate(loss, tau=0.1) if what == "SoftUpdate" else CATSoftUpdate(loss)
+        with torch.no_grad():  # a distance to go
+            for p in loss.parameters():
+                p.add_(0.001 * torch.randn_like(p))
         out[what, name] = (lambda updater=updater: [updater.step() for _ in range(args.steps)], args.steps)
     return out
 

@@ -9,6 +9,7 @@ network, or is being traced, transformed or run under autocast, is left to its m
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from typing import Any, NamedTuple
 from weakref import WeakKeyDictionary
 
@@ -17,11 +18,14 @@ from tensordict import TensorDictBase
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from torchrl_tsallis import native
 from torchrl_tsallis.modules.activations import Squish
 from torchrl_tsallis.modules.linear import Linear
 from torchrl_tsallis.modules.norm import RMSNorm
-from torchrl_tsallis.modules.numerics import is_traced
+from torchrl_tsallis.modules.numerics import is_watched
 from torchrl_tsallis.modules.policy import NormalHead
+from torchrl_tsallis.native.network import fits
+from torchrl_tsallis.native.network import network as native_network
 
 _HOOKS = ("_forward_hooks", "_forward_pre_hooks", "_backward_hooks", "_backward_pre_hooks")
 _NAMES = {Linear: ("weight", "bias"), RMSNorm: ("weight",)}
@@ -55,6 +59,13 @@ def plain_layers(x: Tensor, params: Sequence[Tensor], eps: Sequence[float]) -> T
         x = x * (x.square().mean(-1, keepdim=True) + e).rsqrt() * (scale if scale.ndim == 1 else scale.unsqueeze(1))
         x = x * (1 + x * (x.square() + 4).rsqrt()) / 2
     return _linear(x, params[-2], params[-1])
+
+
+def plain_normal(
+    x: Tensor, params: Sequence[Tensor], *, head: NormalHead, eps: Sequence[float]
+) -> tuple[Tensor, Tensor]:
+    """Mean and scale by :func:`plain_layers` and a head."""
+    return head(plain_layers(x, params, eps))
 
 
 class _Layers(torch.autograd.Function):
@@ -175,6 +186,11 @@ class FastNetwork(NamedTuple):
         own = torch.finfo(x.dtype).eps
         eps = tuple(own if e is None else e for e in self.eps)
         rows = x.reshape(*first.shape[:members], -1, x.shape[-1])
+        kernels = native.active()
+        if kernels is not None and not x.requires_grad and fits(x, *tensors):
+            plain = partial(plain_normal, head=self.head, eps=eps)
+            loc, scale = native_network(kernels, plain, self.sizes, eps, self.head.min_scale, rows, tensors)
+            return loc.view(*x.shape[:-1], -1), scale.view(*x.shape[:-1], -1)
         out = _Layers.apply(eps, rows, *tensors)
         return self.head(out.view(*x.shape[:-1], out.shape[-1]))
 
@@ -199,9 +215,7 @@ def network_of(actor: nn.Module, network: nn.Module) -> FastNetwork | None:
         >>> network_of(actor, actor.module[0].module).sizes
         (3, 100, 100, 4)
     """
-    if is_traced() or torch._C._functorch.peek_interpreter_stack() is not None:
-        return None
-    if type(network) is not nn.Sequential:
+    if type(network) is not nn.Sequential or is_watched():
         return None
     layers = tuple(network._modules.values())
     known = _known.get(network)
@@ -235,5 +249,3 @@ def _recognised(actor: nn.Module, network: nn.Module, layers: tuple[Any, ...]) -
     start = tuple(prefix.split(".")) if prefix else ()
     keys = [(*start, str(name), part) for name, kind in enumerate(kinds) for part in _NAMES.get(kind, ())]
     return FastNetwork(layers, tuple(keys), sizes, tuple(norm.eps for norm in norms))
-
-

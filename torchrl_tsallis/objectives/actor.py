@@ -19,7 +19,10 @@ from tensordict.utils import NestedKey
 from torch import Tensor, nn
 from torch.distributions import Distribution, Independent, Normal
 
+from torchrl_tsallis import native
 from torchrl_tsallis.modules.fast import network_of
+from torchrl_tsallis.modules.numerics import is_watched
+from torchrl_tsallis.native.network import fits, log_density
 
 #: Standardised distances beyond this one are taken for infinite; their fourth power still fits in float32.
 _FAR = 1e9
@@ -87,7 +90,7 @@ def get_dist_with(
         >>> from tensordict import TensorDict
         >>> from torchrl_tsallis.modules import make_policy
         >>> actor, data = make_policy(3, 2), TensorDict({"observation": torch.zeros(5, 3)}, [5])
-        >>> get_dist_with(actor, data, TensorDict.from_module(actor) * 0).mean[0]
+        >>> get_dist_with(actor, data, TensorDict.from_module(actor) * 0).mean[0].detach()
         tensor([0., 0.])
     """
     parts = _network_and_head(actor)
@@ -264,6 +267,31 @@ def _safe_log_prob(dist: Distribution, action: Tensor) -> Tensor:
     """
     if not action.is_floating_point():
         return dist.log_prob(action)
+    fast = _native_log_prob(dist, action)
+    if fast is not None:
+        return fast
+    return _plain_log_prob(dist, action)
+
+
+def _native_log_prob(dist: Distribution, action: Tensor) -> Tensor | None:
+    """The same by the native kernels, where they are used and take it."""
+    kernels = native.active()
+    if kernels is None or not isinstance(dist, Independent) or dist.reinterpreted_batch_ndims != 1:
+        return None
+    normal = dist.base_dist
+    if type(normal) is not Normal or normal._validate_args or dist._validate_args or is_watched():
+        return None
+    loc, scale = normal.loc, normal.scale
+    if not (fits(loc, scale, action) and loc.shape == scale.shape == action.shape) or action.requires_grad:
+        return None
+    return log_density(kernels, _normal_log_prob, loc, scale, action)
+
+
+def _normal_log_prob(loc: Tensor, scale: Tensor, action: Tensor) -> Tensor:
+    return _plain_log_prob(Independent(Normal(loc, scale, validate_args=False), 1, validate_args=False), action)
+
+
+def _plain_log_prob(dist: Distribution, action: Tensor) -> Tensor:
     with torch.no_grad():
         if type(dist.base_dist if isinstance(dist, Independent) else dist) is Normal:
             far = ((action - dist.mean) / dist.stddev).abs() > _FAR
