@@ -110,7 +110,8 @@ class _Layers(torch.autograd.Function):
         for index in range(len(ctx.eps), -1, -1):
             below = kept[4 * index - 1] if index else x
             if needed[3 * index + 1]:
-                grads[3 * index + 1] = g.mT @ below
+                # As autograd multiplies: the transposed product may round otherwise.
+                grads[3 * index + 1] = (below.mT @ g).mT if rows else g.mT @ below
             if needed[3 * index + 2]:
                 grads[3 * index + 2] = g.sum(rows)
             if not index:
@@ -144,13 +145,17 @@ class FastNetwork(NamedTuple):
 
     Attributes:
         layers: the modules in their order, the head last.
+        kinds: their classes, which a parametrization changes.
         keys: of the parameters in the tensordict of the actor's, in the order of :func:`plain_layers`.
+        shapes: of the parameters.
         sizes: of the input, the hidden layers and the last layer's output.
         eps: epsilon of each RMSNorm; None for the data type's own.
     """
 
     layers: tuple[nn.Module, ...]
+    kinds: tuple[type, ...]
     keys: tuple[tuple[str, ...], ...]
+    shapes: tuple[torch.Size, ...]
     sizes: tuple[int, ...]
     eps: tuple[float | None, ...]
 
@@ -180,6 +185,7 @@ class FastNetwork(NamedTuple):
             and x.shape[-1] == self.sizes[0]
             and x.shape[:members] == first.shape[:members]
             and x.numel()
+            and all(p.shape == first.shape[:members] + shape for p, shape in zip(tensors, self.shapes, strict=True))
             and not torch.is_autocast_enabled(x.device.type)
         ):
             return None
@@ -219,7 +225,7 @@ def network_of(actor: nn.Module, network: nn.Module) -> FastNetwork | None:
         return None
     layers = tuple(network._modules.values())
     known = _known.get(network)
-    if known is None or known.layers != layers:
+    if known is None or known.layers != layers or known.kinds != tuple(map(type, layers)):
         known = _known[network] = _recognised(actor, network, layers)
     if known is None or any(_is_changed(module) for module in (network, *layers)):
         return None
@@ -248,4 +254,5 @@ def _recognised(actor: nn.Module, network: nn.Module, layers: tuple[Any, ...]) -
         return None
     start = tuple(prefix.split(".")) if prefix else ()
     keys = [(*start, str(name), part) for name, kind in enumerate(kinds) for part in _NAMES.get(kind, ())]
-    return FastNetwork(layers, tuple(keys), sizes, tuple(norm.eps for norm in norms))
+    shapes = tuple(getattr(layers[int(key[-2])], key[-1]).shape for key in keys)
+    return FastNetwork(layers, tuple(kinds), tuple(keys), shapes, sizes, tuple(norm.eps for norm in norms))

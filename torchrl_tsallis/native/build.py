@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import platform
+import shlex
 import shutil
 import subprocess
 import tempfile
@@ -37,11 +38,9 @@ def build(path: Path | None = None) -> Path:
             f"the native kernels are written for Linux on x86-64, this is {platform.system()} on {platform.machine()}: "
             "nothing was built, and torch computes as before"
         )
-    compiler = os.environ.get("CXX", "c++")
-    if shutil.which(compiler) is None:
-        raise BuildError(
-            f"no C++ compiler: install one (such as the package g++), or name it by CXX; {compiler!r} is none"
-        )
+    compiler = os.environ.get("CXX") or "c++"
+    if shutil.which(shlex.split(compiler)[0]) is None:
+        raise BuildError(f"no C++ compiler {compiler!r}: install one, such as the package g++, or name another by CXX")
     if shutil.which("ninja") is None:
         raise BuildError("no ninja, by which torch builds: install the package ninja, or torchrl-tsallis[native]")
     from torch.utils import cpp_extension

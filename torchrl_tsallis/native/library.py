@@ -10,6 +10,7 @@ from contextlib import contextmanager
 from ctypes import c_float, c_int, c_int64, c_void_p
 from pathlib import Path
 
+import torch
 from torchrl._utils import logger
 
 #: Of the C interface, ``tsallis_version()``; a library of another one is not used.
@@ -104,14 +105,14 @@ def forget() -> None:
 
 
 def active() -> ctypes.CDLL | None:
-    """The kernels, where they are built, fit this machine and are not switched off; else None.
+    """The kernels, where they are built, fit this machine and are not switched off; else None, as for a compiler.
 
     Examples:
         >>> with used(False):
         ...     active() is None
         True
     """
-    return _look() if _used else None
+    return _look() if _used and not torch.compiler.is_compiling() else None
 
 
 def is_available() -> bool:

@@ -275,11 +275,11 @@ def _safe_log_prob(dist: Distribution, action: Tensor) -> Tensor:
 
 def _native_log_prob(dist: Distribution, action: Tensor) -> Tensor | None:
     """The same by the native kernels, where they are used and take it."""
-    kernels = native.active()
+    kernels = None if is_watched() else native.active()
     if kernels is None or not isinstance(dist, Independent) or dist.reinterpreted_batch_ndims != 1:
         return None
     normal = dist.base_dist
-    if type(normal) is not Normal or normal._validate_args or dist._validate_args or is_watched():
+    if type(normal) is not Normal or normal._validate_args or dist._validate_args:
         return None
     loc, scale = normal.loc, normal.scale
     if not (fits(loc, scale, action) and loc.shape == scale.shape == action.shape) or action.requires_grad:

@@ -152,6 +152,8 @@ class CATGroup:
         floor = floor_target(d2, v, seg.expand(distance), seg.expand(nu.reciprocal()), eps)
         rate = seg.expand(share.mul_(tau))
         v.addcmul_(rate, d2.add_(floor).sub_(v))
+        if tau == 1:
+            v.clamp_(min=eps**2)  # where v was much larger, the rounding of it may have left nothing
         nu.copy_(new_nu)
         followed, followed_views = self.buffers[1]
         torch.mul(rate, d, out=followed)

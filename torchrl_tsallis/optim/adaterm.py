@@ -241,6 +241,8 @@ class _Layout:
         s.addcmul_(share_flat, d2.sub_(s), value=1 - beta2)
         floor.addcmul_(share_flat, de.sub_(floor), value=1 - beta2)
         nu.copy_(new_nu)
+        if beta2 == 0:
+            floor.clamp_(min=eps**2)  # where it was much larger, the rounding of it may have left nothing
         second = s
         if group["amsgrad"]:
             largest = f["max_exp_avg_sq"]
