@@ -5,7 +5,7 @@ contenders of a group in turn, with the quartiles beside it; with the native ker
 without and with them::
 
     python benchmarks/bench_speed.py --out docs/results/speed.csv
-    python benchmarks/bench_speed.py --groups stacked --members 1 8 24 96 --batch 64 256 1024 --append --out speed.csv
+    python benchmarks/bench_speed.py --groups stacked floor --methods proposal --members 1 8 24 96 --append --out FILE
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ METHODS: dict[str, Callable[[], dict[str, Any]]] = {
     "proposal": lambda: {},
 }
 #: Contender: a function of one call, how many member-steps that is, and the kernels that it uses.
-Contenders = dict[tuple[str, str], tuple[Callable[[], Any], int]]
+Contenders = dict[tuple[str, str], tuple[Callable[[], Any], float]]
 
 
 @contextmanager
@@ -205,8 +205,31 @@ def target_group(args: argparse.Namespace) -> Contenders:
     return out
 
 
+def floor_group(args: argparse.Namespace) -> Contenders:
+    """A member-step's matrix products alone, at the rate of torch's batched product and of one large product."""
+    torch.manual_seed(0)
+    weights = OBSERVATION * args.width + args.width**2 + args.width * 2 * ACTION
+    # Forward, backward (twice that, but for the observations' gradient), and the target's forward.
+    flop = {"proposal": 2 * args.batch * (4 * weights - OBSERVATION * args.width)}
+    flop["bc, peak"] = 2 * args.batch * (3 * weights - OBSERVATION * args.width)
+    x, w = torch.randn(args.members, args.batch, args.width), torch.randn(args.members, args.width, args.width)
+    large = torch.randn(512, 512)
+    products = {
+        "batched": (lambda: torch.bmm(x, w), 2 * w.numel() * args.batch),
+        "512 x 512": (lambda: large @ large, 2 * 512**3),
+    }
+    out: Contenders = {}
+    for method, needed in flop.items():
+        for name, (product, done) in products.items():
+            calls = max(1, args.steps * needed * args.members // done)
+            run = lambda product=product, calls=calls: [product() for _ in range(calls)]  # noqa: E731
+            out[f"products of {method}, {name}", "torch"] = (run, calls * done / needed)
+    return out
+
+
 GROUPS = {
     "stacked": stacked_group,
+    "floor": floor_group,
     "single": single_group,
     "recurrent": recurrent_group,
     "optimizer": optimizer_group,
@@ -246,7 +269,7 @@ def rows_of(group: str, args: argparse.Namespace, machine: dict[str, str]) -> li
         rows.append(row | {"ratio": f"{statistics.median(ratios):.4f}", "low": f"{low:.4f}", "high": f"{high:.4f}"})
         times = float(rows[-1]["ratio"])
         print(
-            f"  {what:26}{name:8}{rows[-1]['milliseconds']:>9} ms   {times:6.3f} of {first[0]} "
+            f"  {what:38}{name:8}{rows[-1]['milliseconds']:>9} ms   {times:6.3f} of {first[0]} "
             f"({low:.3f} to {high:.3f}), {1 / times:5.2f} times as fast",
             flush=True,
         )
