@@ -1,6 +1,6 @@
 """The pictures of docs/speed.md from its raw file::
 
-    python benchmarks/plot_speed.py --input docs/results/speed.csv --output docs/results/speed.png
+python benchmarks/plot_speed.py --input docs/results/speed.csv --output docs/results/speed.png
 """
 
 from __future__ import annotations
