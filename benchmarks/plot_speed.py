@@ -1,4 +1,6 @@
-"""The pictures of docs/speed.md from its raw file::
+"""The pictures of docs/speed.md from its raw file.
+
+In a shell::
 
 python benchmarks/plot_speed.py --input docs/results/speed.csv --output docs/results/speed.png
 """
