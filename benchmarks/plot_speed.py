@@ -22,7 +22,7 @@ LINES = [
     ("proposal, native kernels", "proposal, stacked", "native"),
     ("its products alone, batched", "products of proposal, batched", "torch"),
 ]
-SIZES = {"members": "stacked members", "batch": "batch", "width": "width", "threads": "threads", "rows": "samples"}
+SIZES = {"members": "stacked members", "batch": "batch", "width": "width", "rows": "samples"}
 USUAL = {"members": "24", "batch": "256", "width": "100", "threads": "1", "rows": "29970"}
 
 
