@@ -51,7 +51,7 @@ def draw(rows: list[dict[str, str]], path: Path) -> None:
         axes.set_xlabel(label)
         axes.spines[["top", "right"]].set_visible(False)
     figure.axes[0].set_ylabel("ms a member-step")
-    figure.axes[0].legend(frameon=False, fontsize=6)
+    figure.axes[-1].legend(frameon=False, fontsize=6, loc="center", bbox_to_anchor=(0.5, 0.72))
     with atomic_path(path) as temporary:
         figure.savefig(temporary, format=path.suffix[1:])
 
