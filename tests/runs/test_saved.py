@@ -107,7 +107,7 @@ def test_a_rating_of_ones_own_is_saved_and_opened_without_a_word_elsewhere(tmp_p
     loss, batch = trained(Threshold(limit=0.5))
     save(tmp_path, loss)
     run = Run.open(tmp_path)
-    assert run.settings["method"] == {"rating": "Threshold", "limit": 0.5, "beta": 0.0}
+    assert run.settings["method"] == {"rating": f"{__name__}.Threshold", "limit": 0.5, "beta": 0.0}
     assert isinstance(run.loss().rating_module, Threshold)
     torch.testing.assert_close(run.rate(batch), loss.rating(batch), rtol=0, atol=0)
 
@@ -124,6 +124,17 @@ def test_a_rating_that_could_not_be_opened_is_refused_before_anything_is_written
 def test_a_rating_whose_module_was_not_imported_is_named(tmp_path, monkeypatch):
     loss, batch = trained(Threshold(), steps=1)
     save(tmp_path, loss)
-    monkeypatch.delitem(Rating.known, "Threshold")
-    with pytest.raises(ValueError, match="rating 'Threshold' of run.json is not known here, only .*peak.*: import the"):
+    monkeypatch.delitem(Rating.known, Threshold.saved_as)
+    with pytest.raises(ValueError, match="Threshold' of run.json is not known here, only .*peak.*: import the module"):
         Run.open(tmp_path).rate(batch)
+
+
+def test_two_ratings_of_one_name_do_not_meet():
+    assert type("Threshold", (Threshold,), {"__module__": "elsewhere"}).saved_as == "elsewhere.Threshold"
+    assert Rating.known[Threshold.saved_as] is Threshold
+    with pytest.raises(TypeError, match="mine.Peak is saved as 'peak', as .*PeakRating is: rename it"):
+        type("Peak", (Rating,), {"__module__": "mine", "saved_as": "peak"})
+    assert Rating.known["peak"] is PeakRating
+    again = type(Threshold.__qualname__, (Threshold,), {"__module__": Threshold.__module__})
+    assert Rating.known[Threshold.saved_as] is again  # as in a notebook
+    Rating.known[Threshold.saved_as] = Threshold

@@ -115,7 +115,7 @@ class Rating(nn.Module):
         False
     """
 
-    #: What ``run.json`` calls the class. Default: the class's own name.
+    #: What ``run.json`` calls the class. Default: its module and name.
     saved_as: ClassVar[str] = ""
     #: The classes by that, of modules that were imported.
     known: ClassVar[dict[str, type[Rating]]] = {}
@@ -127,10 +127,20 @@ class Rating(nn.Module):
     beta: Tensor
 
     def __init_subclass__(cls, **options: Any) -> None:
-        """Makes the class known to runs that are opened."""
+        """Makes the class known to runs that are opened.
+
+        Raises:
+            TypeError: if another class is saved by the same name.
+        """
         super().__init_subclass__(**options)
-        cls.saved_as = cls.__dict__.get("saved_as") or cls.__name__
-        Rating.known[cls.saved_as] = cls
+        own = f"{cls.__module__}.{cls.__qualname__}"
+        cls.saved_as = cls.__dict__.get("saved_as") or own
+        there = Rating.known.setdefault(cls.saved_as, cls)
+        if f"{there.__module__}.{there.__qualname__}" != own:
+            raise TypeError(
+                f"{own} is saved as {cls.saved_as!r}, as {there.__module__}.{there.__qualname__} is: rename it"
+            )
+        Rating.known[cls.saved_as] = cls  # a class that is defined again, as in a notebook
 
     @classmethod
     def settings_of(cls, state: Mapping[str, Tensor]) -> dict[str, Any]:
