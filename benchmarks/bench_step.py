@@ -27,9 +27,9 @@ REPEATS = 11
 Step = Callable[[TensorDict], None]
 
 
-def make_step(loss: LossModule) -> Step:
+def make_step(loss: LossModule, make_optimizer: Callable[..., torch.optim.Optimizer] = torch.optim.Adam) -> Step:
     """A step that minimises the sum of a loss' terms, and updates what the loss has: a target network, a rating."""
-    optimizer = torch.optim.Adam(loss.parameters())
+    optimizer = make_optimizer(loss.parameters())
     after = [optimizer.step, optimizer.zero_grad]
     if isinstance(loss, TsallisBCLoss):
         after += [CATSoftUpdate(loss).step] if loss.needs_target else []

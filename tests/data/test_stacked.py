@@ -53,6 +53,18 @@ def test_state_dict_continues_exactly(before):
     assert torch.equal(again.sample(None, 6)[0], sampler.sample(None, 6)[0])
 
 
+def test_batches_of_changing_size_and_a_late_state_are_those_of_the_single_samplers():
+    together, alone = MemberSampler([3, 4], [range(20), range(20)]), [MemberSampler([s], [range(20)]) for s in (3, 4)]
+    for size in (6, 6, 4, 7, 20, 3, 17, 1, 6):
+        index, _ = together.sample(None, size)
+        assert torch.equal(index, torch.cat([sampler.sample(None, size)[0] for sampler in alone]))
+        index.zero_()  # nothing that is given away is the sampler's own
+    resumed = MemberSampler([0, 0], [range(20), range(20)])
+    resumed.load_state_dict(together.state_dict())
+    for size in (6, 9, 6):
+        assert torch.equal(resumed.sample(None, size)[0], together.sample(None, size)[0])
+
+
 def test_dumps_and_loads(tmp_path):
     sampler = MemberSampler([3, 4], [range(20), range(20)])
     sampler.sample(None, 6)

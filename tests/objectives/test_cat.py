@@ -11,6 +11,8 @@ from tensordict.nn import TensorDictModule
 from torchrl.objectives import SoftUpdate
 from torchrl.objectives.common import LossModule
 
+from torchrl_tsallis.modules import make_policy
+from torchrl_tsallis.objectives.bc import TsallisBCLoss
 from torchrl_tsallis.objectives.cat import CATSoftUpdate
 
 
@@ -268,3 +270,16 @@ def test_a_start_of_the_scale_that_does_not_exist_is_named(value):
 def test_wrong_arguments(options):
     with pytest.raises(ValueError, match=next(iter(options))):
         CATSoftUpdate(_Loss(_net()), **options)
+
+
+def test_a_target_that_follows_at_once_keeps_a_scale():
+    torch.manual_seed(1)
+    loss = TsallisBCLoss([make_policy(3, 2, hidden=(9,)) for _ in range(3)])
+    updater = CATSoftUpdate(loss, tau=1.0, k=math.inf, strength=0.0)
+    for size in (0.01, 0.01, 0.01, 0.3, 1e-7, 0.01, 1e-7, 1.0, 1e-7):
+        with torch.no_grad():
+            for p in loss.parameters():
+                p.add_(size * torch.randn_like(p))
+        updater.step()
+        scales = updater.state_dict()["cat"]["target_actor_network_params"]["scale"]
+        assert all((x >= 1e-10 * (1 - 1e-6)).all() for x in scales.values())

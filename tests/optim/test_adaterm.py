@@ -269,3 +269,14 @@ def test_a_state_that_does_not_fit_says_what_it_is_of():
     layer(torch.ones(2)).sum().backward()
     with pytest.raises(ValueError, match=r"'exp_avg' has shape \(1, 3\).*\(1, 2\).*another network"):
         optim.step()
+
+
+def test_a_large_floor_that_is_left_at_once_leaves_the_least_one():
+    p = torch.nn.Parameter(torch.zeros(4))
+    optim = AdaTerm([p], betas=(0.0, 0.0, 0.9))
+    _run(optim, [p], [[torch.tensor([3e7, 1.0, 1.0, 1.0])], [torch.tensor([3e7, 1.0, 1.0, 1.0])]])
+    assert optim.state[p]["floor"].min().item() >= 1e-10 * (1 - 1e-6)
+    _run(optim, [p], [[torch.zeros(4)], [torch.full((4,), 1e-6)], [torch.zeros(4)]])
+    assert optim.state[p]["floor"].min().item() >= 1e-10 * (1 - 1e-6)
+    assert optim.state[p]["skipped"].item() == 0
+    assert p.isfinite().all()

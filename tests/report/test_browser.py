@@ -2,6 +2,16 @@
 
 from __future__ import annotations
 
+import pytest
+import torch
+from tensordict import TensorDict
+
+pytest.importorskip("jinja2")
+pytest.importorskip("matplotlib")
+
+from torchrl_tsallis.report.modes_page import write_modes_report
+from torchrl_tsallis.run import modes
+
 
 def names(browser) -> list[str]:
     return browser.evaluate("[...document.querySelectorAll('.sortable tbody td.name')].map((cell) => cell.textContent)")
@@ -55,3 +65,18 @@ def test_without_scripts_everything_is_there(browser, reported):
     text = browser.evaluate("document.body.innerText")
     assert "Review queue" in text and "demo_11" in text and "tsallis curate" in text
     assert browser.evaluate("document.querySelectorAll('button').length") == 0
+
+
+def test_the_page_of_modes_is_quiet_and_fits_a_phone(browser, tmp_path):
+    rows = {"observation": torch.rand(80, 2), "action": torch.rand(80, 1), "episode": torch.arange(80) // 10}
+    data = TensorDict({**rows, "operator": rows["episode"] % 2}, [80])
+    modes(data, tmp_path / "modes", components=2, updates=2, labels="operator", progress=False)
+    page = write_modes_report(tmp_path / "modes")
+    browser.open(page.as_uri())
+    for width in (1280, 400, 320):
+        browser.ask("Emulation.setDeviceMetricsOverride", width=width, height=800, deviceScaleFactor=1, mobile=True)
+        assert browser.evaluate("document.documentElement.scrollWidth <= document.documentElement.clientWidth"), width
+    text = browser.evaluate("document.body.innerText")
+    assert "Who belongs together" in text and "operator" in text and "tsallis train" in text
+    assert browser.asked() == [page.as_uri()]
+    assert browser.faults() == []

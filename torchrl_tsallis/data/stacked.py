@@ -68,6 +68,7 @@ class MemberSampler(Sampler):
     def _empty(self) -> None:
         """Forgets the current orders; the next sample draws new ones."""
         self._orders = [torch.empty(0, dtype=torch.int64) for _ in self.rows]
+        self._together: torch.Tensor | None = None  # the orders as one tensor, while all members are at one position
         self._positions = [0 for _ in self.rows]
         self._before = [generator.get_state() for generator in self.generators]
 
@@ -76,10 +77,15 @@ class MemberSampler(Sampler):
         rows, generator = self.rows[member], self.generators[member]
         self._before[member] = generator.get_state()
         self._orders[member] = torch.randperm(len(rows), generator=generator).add_(rows.start)
+        self._together = None
         self._positions[member] = 0
 
     def sample(self, storage: Storage | None, batch_size: int) -> tuple[torch.Tensor, dict[str, Any]]:
         """Rows of the next batches, ``[S, batch_size]``."""
+        start = self._positions[0]
+        if self._together is not None and start + batch_size <= self._together.shape[1]:
+            self._positions = [start + batch_size] * len(self.rows)
+            return self._together[:, start : start + batch_size].clone(), {}
         index = []
         for member, rows in enumerate(self.rows):
             if len(rows) < batch_size:
@@ -90,6 +96,9 @@ class MemberSampler(Sampler):
                 start = 0
             index.append(self._orders[member][start : start + batch_size])
             self._positions[member] = start + batch_size
+        if self._together is None and len(set(self._positions)) == len({len(order) for order in self._orders}) == 1:
+            self._together = torch.stack(self._orders)
+            self._orders = list(self._together)  # views: the orders are there once
         return torch.stack(index), {}
 
     def state_dict(self) -> dict[str, Any]:

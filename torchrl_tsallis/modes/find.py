@@ -99,22 +99,22 @@ def find_modes_of_each(
     What is found is the same as in one set after the other, up to rounding, where the sets are equally long.
 
     Args:
-        sets: of demonstrations of the same robot, each as there.
+        sets: of demonstrations of the same robot, ``[N]`` each.
         seeds: one a set.
-        components: as there.
-        starts: as there.
-        batch_size: as there.
-        updates: as there.
-        threshold: as there.
-        always: as there.
-        device: as there.
-        progress: as there.
+        components: of a mixture; at most a third of the episodes of the smallest set are taken.
+        starts: of mixtures of each set.
+        batch_size: samples a step and component.
+        updates: of the responsibilities, an epoch between two.
+        threshold: least share of starts in which the episodes of a mode are together.
+        always: whether modes are what the starts agree on, however little that is.
+        device: of the policies.
+        progress: whether to show a bar.
 
     Returns:
         The modes of each set.
 
     Raises:
-        ValueError: as there, or if there is not a seed a set.
+        ValueError: as for :func:`find_modes`, or if there is not a seed a set.
     """
     components, starts = (int(check_number(name, value, low=2, high=MOST_MEMBERS, integer=True)) for name, value in
                           (("components", components), ("starts", starts)))  # fmt: skip

@@ -18,6 +18,16 @@ def is_traced() -> bool:
     return torch.compiler.is_compiling() or torch.jit.is_tracing() or torch.onnx.is_in_onnx_export()
 
 
+def is_watched() -> bool:
+    """Whether a compiler, exporter, tracer or function transform such as ``torch.vmap`` is looking.
+
+    Examples:
+        >>> is_watched(), torch.vmap(lambda x: x if is_watched() else -x)(torch.ones(1))
+        (False, tensor([1.]))
+    """
+    return is_traced() or torch._C._functorch.peek_interpreter_stack() is not None
+
+
 def widened(x: Tensor) -> Tensor:
     """Half-precision numbers as float32, as torch's own layers compute inside; others as they are.
 

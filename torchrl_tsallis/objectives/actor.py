@@ -2,25 +2,22 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any
 
 import torch
-from tensordict import TensorDictBase, TensorDictParams, is_tensor_collection
+from tensordict import TensorDictBase, TensorDictParams
 from tensordict.nn import (
-    CompositeDistribution,
     ProbabilisticTensorDictModule,
     ProbabilisticTensorDictSequential,
     TensorDictModule,
 )
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
-from torch.distributions import Distribution, Independent, Normal
+from torch.distributions import Distribution
 
-#: Standardised distances beyond this one are taken for infinite; their fourth power still fits in float32.
-_FAR = 1e9
+from torchrl_tsallis.modules.fast import network_of
 
 
 def _network_and_head(
@@ -51,6 +48,49 @@ def _call(network: TensorDictModule, tensors: Sequence[Any]) -> dict[NestedKey, 
     elif not isinstance(out, (tuple, list)):
         out = [out]
     return dict(zip(keys, out, strict=True))
+
+
+def _fast_outputs(
+    actor: ProbabilisticTensorDictSequential,
+    parts: tuple[TensorDictModule, ProbabilisticTensorDictModule] | None,
+    inputs: TensorDictBase,
+    params: TensorDictBase,
+) -> dict[NestedKey, Any] | None:
+    """The network's outputs by key, where it is the paper's; its parameters need not be written into it."""
+    if parts is None or len(parts[0].in_keys) != 1 or len(parts[0].out_keys) != 2:
+        return None
+    network = network_of(actor, parts[0].module)
+    out = None if network is None else network(inputs.get(parts[0].in_keys[0]), params)
+    return None if out is None else dict(zip(parts[0].out_keys, out, strict=True))
+
+
+def get_dist_with(
+    actor: ProbabilisticTensorDictSequential, inputs: TensorDictBase, params: TensorDictBase
+) -> Distribution:
+    """:func:`get_dist` of an actor with other parameters.
+
+    Args:
+        actor: stochastic actor.
+        inputs: with the actor's input keys, ``[*B]``.
+        params: parameters of the actor, such as those of its target network.
+
+    Returns:
+        The distribution of the action, batch shape ``[*B]``.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl_tsallis.modules import make_policy
+        >>> actor, data = make_policy(3, 2), TensorDict({"observation": torch.zeros(5, 3)}, [5])
+        >>> get_dist_with(actor, data, TensorDict.from_module(actor) * 0).mean[0].detach()
+        tensor([0., 0.])
+    """
+    parts = _network_and_head(actor)
+    fast = _fast_outputs(actor, parts, inputs, params)
+    if parts is not None and fast is not None:
+        return parts[1].get_dist(fast)
+    with params.to_module(actor, preserve_module_state=False):
+        return get_dist(actor, inputs)
 
 
 def get_dist(actor: ProbabilisticTensorDictSequential, inputs: TensorDictBase) -> Distribution:
@@ -151,6 +191,9 @@ def get_stacked_dist(
     if actor.return_composite:
         raise NotImplementedError("stacked members need an actor with one distribution (return_composite=False)")
 
+    fast = _fast_outputs(actor, parts, inputs, params)
+    if parts is not None and fast is not None:
+        return parts[1].get_dist(fast)
     if parts is not None and _is_stackable(parts[0].module):
         with params.to_module(actor, preserve_module_state=False), named_inputs(actor, inputs):
             return parts[1].get_dist(_call(parts[0], [inputs.get(key) for key in parts[0].in_keys]))
@@ -164,67 +207,6 @@ def get_stacked_dist(
         if parts is None:
             return actor.build_dist_from_params(vectorized(params, inputs.copy()))
         return parts[1].get_dist(vectorized(params, *(inputs.get(key) for key in parts[0].in_keys)))
-
-
-def log_prob_of(dist: Distribution, inputs: TensorDictBase, action_key: NestedKey) -> Tensor:
-    """Log-density at the actions, after a check of the shapes, which broadcasting would hide.
-
-    Args:
-        dist: the actor's distribution, batch shape ``[*B]``.
-        inputs: with the action, ``[*B]``.
-        action_key: key of the action.
-
-    Returns:
-        The log-density, ``[*B]``.
-
-    Raises:
-        ValueError: if the shapes do not fit.
-    """
-    if isinstance(dist, CompositeDistribution):
-        log_prob = dist.log_prob(inputs)
-        return torch.stack(list(log_prob.values(True, True))).sum(0) if is_tensor_collection(log_prob) else log_prob
-    action, expected = inputs.get(action_key), dist.batch_shape + dist.event_shape
-    if dist.event_shape and action.shape != expected:
-        raise ValueError(
-            f"{action_key!r} has shape {list(action.shape)}, the actor's distribution {list(expected)}: the two must "
-            "be equal (check the actor's action_dim and the batch size)"
-        )
-    try:
-        log_prob = _safe_log_prob(dist, action)
-    except (RuntimeError, TypeError) as error:
-        if action.dtype.is_floating_point or torch.compiler.is_compiling():
-            raise
-        raise TypeError(
-            f"{action_key!r} is {action.dtype}, of which the actor's {type(dist).__name__} has no density: convert the "
-            "data to the type of the actor's parameters"
-        ) from error
-    shape, batch = log_prob.shape, inputs.batch_size
-    # Without a batch size of its own the batch is what all inputs have in common, as for TorchRL's losses.
-    fits = shape == batch if batch else all(x.shape[: len(shape)] == shape for x in inputs.values(True, True))
-    if not fits:
-        raise ValueError(
-            f"log_prob has shape {list(shape)}, the batch {list(batch)}: give the batch its "
-            "full batch size, and use a distribution that sums over the action's dimensions (IndependentNormal)"
-        )
-    return log_prob
-
-
-def _safe_log_prob(dist: Distribution, action: Tensor) -> Tensor:
-    """Log-density that is -inf, without gradient, for actions so far away that their gradient would overflow.
-
-    The rating of such an action is 0, and 0 * inf would be NaN in the gradient of every parameter.
-    """
-    if not action.is_floating_point():
-        return dist.log_prob(action)
-    with torch.no_grad():
-        if type(dist.base_dist if isinstance(dist, Independent) else dist) is Normal:
-            far = ((action - dist.mean) / dist.stddev).abs() > _FAR
-            instead = dist.mean
-        else:
-            far, instead = action.isinf(), torch.zeros_like(action)
-        action = torch.where(far, instead, action)
-        far = far.any(-1) if dist.event_shape else far
-    return dist.log_prob(action).masked_fill(far, -math.inf)
 
 
 def own_parameters(params: TensorDictParams) -> TensorDictParams:

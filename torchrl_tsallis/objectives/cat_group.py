@@ -9,6 +9,8 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
+from torchrl_tsallis import native
+from torchrl_tsallis.native import updates
 from torchrl_tsallis.objectives.replaced import replaced_members
 from torchrl_tsallis.optim.segments import Segments
 from torchrl_tsallis.optim.student_t import floor_target, robust_rate
@@ -73,11 +75,13 @@ class CATGroup:
         self.waiting = True  # for the first difference of some tensor
         self.spread: Tensor | None = None  # variance of each tensor of the target, once it was asked for
         self.alone: Tensor | None = None
+        self.members: Tensor | None = None  # those that are not pulled
         self.buffers: list[tuple[Tensor, list[Tensor]]] = []  # of a step
+        self.layout: updates.Layout | None = None
 
     def __getstate__(self) -> dict[str, Any]:
         """A pickled view is no view any more: the buffers are made anew."""
-        return {**self.__dict__, "buffers": []}
+        return {**self.__dict__, "buffers": [], "layout": None}
 
     def _started(self, like: Tensor) -> dict[str, Tensor]:
         """The state at the start."""
@@ -107,7 +111,8 @@ class CATGroup:
         self.buffers = [self.segments.buffer(like) for _ in range(2)]
         self.spread = None
         if members is not None and self.segments.batch_dims == 1:
-            self.alone = self.segments.expand(~members.to(like.device).repeat(len(self.target)))
+            self.members = ~members.to(like.device)
+            self.alone = self.segments.expand(self.members.repeat(len(self.target)))
 
     def _difference(self) -> Tensor:
         d, views = self.buffers[0]
@@ -130,6 +135,8 @@ class CATGroup:
         scale = self.state["scale"]
         if not self.buffers or scale.dtype != self.target[0].dtype or scale.device != self.target[0].device:
             self._follow_type(members)
+        if self._native_step(tau, strength):
+            return None
         seg, eps, d = self.segments, self.eps, self._difference()
         limit = torch.finfo(d.dtype).max / 16
         d2 = d.square().clamp_(max=limit)
@@ -145,6 +152,8 @@ class CATGroup:
         floor = floor_target(d2, v, seg.expand(distance), seg.expand(nu.reciprocal()), eps)
         rate = seg.expand(share.mul_(tau))
         v.addcmul_(rate, d2.add_(floor).sub_(v))
+        if tau == 1:
+            v.clamp_(min=eps**2)  # where v was much larger, the rounding of it may have left nothing
         nu.copy_(new_nu)
         followed, followed_views = self.buffers[1]
         torch.mul(rate, d, out=followed)
@@ -157,6 +166,25 @@ class CATGroup:
                 d.masked_fill_(self.alone, 0.0)  # a member that is not rated by its target is left alone
             torch._foreach_sub_(self.source, self.buffers[0][1], alpha=strength)
         return replaced
+
+    def _native_step(self, tau: float, strength: float) -> bool:
+        """The same by the native kernels, where they are used and no tensor may have been replaced; whether it was."""
+        kernels = native.active()
+        if kernels is not None and self.waiting and bool(self.state["started"].all()):
+            self.waiting = False  # as after a load
+        if kernels is None or self.waiting or not updates.are_plain(*self.source, *self.target):
+            return False
+        if self.layout is None:
+            self.layout = updates.Layout(self.segments.sizes, self.segments.counts)
+        distance = torch.empty_like(self.state["nu"])
+        updates.cat_distance(kernels, self.layout, self.source, self.target, self.state["scale"], distance)
+        if not distance.max().item() <= _FAR:
+            return False
+        options = (tau, strength, self.eps, self.k)
+        updates.cat(kernels, self.layout, self.source, self.target, self.state, distance, self.members, options)
+        for copy, target in self.copies:
+            copy.copy_(target)
+        return True
 
     def _is_far(self, distance: Tensor, d2: Tensor) -> bool:
         """Whether a tensor is as far from its target as others would be: cheap, for every step."""

@@ -10,8 +10,9 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 from torch.distributions import Distribution
 
-from torchrl_tsallis.objectives.actor import get_dist, get_stacked_dist, log_prob_of
+from torchrl_tsallis.objectives.actor import get_dist_with, get_stacked_dist
 from torchrl_tsallis.objectives.inputs import mask_of, select_inputs
+from torchrl_tsallis.objectives.log_prob import log_prob_of
 from torchrl_tsallis.ratings.base import Evidence, Rating
 from torchrl_tsallis.ratings.batch import Batch
 
@@ -39,8 +40,7 @@ class ActorPasses:
         """The distribution, and what else a variant of the loss needs of the same pass of the network."""
         if self.num_members is not None:
             return get_stacked_dist(self.actor_network, inputs, params, self.vmap_randomness), None
-        with params.to_module(self.actor_network, preserve_module_state=False):
-            return get_dist(self.actor_network, inputs), None
+        return get_dist_with(self.actor_network, inputs, params), None
 
     @torch.no_grad()
     def _target_log_prob(self, inputs: TensorDictBase) -> Tensor | None:

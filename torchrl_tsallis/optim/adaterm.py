@@ -10,6 +10,8 @@ import torch
 from torch import Tensor
 from torch.optim import Optimizer
 
+from torchrl_tsallis import native
+from torchrl_tsallis.native import updates
 from torchrl_tsallis.optim.options import check_group, check_params
 from torchrl_tsallis.optim.segments import Segments
 from torchrl_tsallis.optim.student_t import floor_target, robust_rate
@@ -174,6 +176,7 @@ class _Layout:
         self.grad, self.grad_views = self.segments.buffer(params[0])
         self.update, self.update_views = self.segments.buffer(params[0])
         self.zero = params[0].new_zeros(())
+        self.layout = updates.Layout(self.segments.sizes, self.segments.counts)
         dof = max(group["k"] + group["eps"], group["ini_dof"] or 0.0)
         scalars = {"step": 0.0, "nu": dof, "skipped": 0.0}
         scalars |= {"bias1": 0.0, "bias2": 0.0} if group["adaptive_bias"] else {}
@@ -198,10 +201,16 @@ class _Layout:
 
     def step(self, group: dict[str, Any], params: list[Tensor]) -> None:
         """One update of the parameters from their gradients."""
+        grads = [p.grad for p in params if p.grad is not None]
+        kernels = native.active() if group["skip_nonfinite"] else None
+        if kernels is not None and self._is_plain(group, params, grads):
+            options = (group["lr"], *group["betas"], group["eps"], group["k"], group["weight_decay"])
+            updates.adaterm(kernels, self.layout, params, grads, self.flat, [float(x) for x in options])
+            return
         seg, f, (beta1, beta2, beta_nu), eps = self.segments, self.flat, group["betas"], group["eps"]
         m, s, floor, nu = f["exp_avg"], f["exp_avg_sq"], f["floor"], f["nu"]
         d = self.grad
-        torch._foreach_copy_(self.grad_views, [p.grad for p in params if p.grad is not None])
+        torch._foreach_copy_(self.grad_views, grads)
         if group["weight_decay"]:
             d.add_(seg.flatten(params), alpha=group["weight_decay"])
         d.sub_(m)
@@ -232,6 +241,8 @@ class _Layout:
         s.addcmul_(share_flat, d2.sub_(s), value=1 - beta2)
         floor.addcmul_(share_flat, de.sub_(floor), value=1 - beta2)
         nu.copy_(new_nu)
+        if beta2 == 0:
+            floor.clamp_(min=eps**2)  # where it was much larger, the rounding of it may have left nothing
         second = s
         if group["amsgrad"]:
             largest = f["max_exp_avg_sq"]
@@ -248,6 +259,12 @@ class _Layout:
             scale, v = scale.masked_fill(bad, 0.0), v.clamp_(min=torch.finfo(v.dtype).tiny)
         torch.mul(seg.expand(scale), m, out=self.update).div_(v.sqrt_())
         torch._foreach_sub_(params, self.update_views)
+
+    @staticmethod
+    def _is_plain(group: dict[str, Any], params: list[Tensor], grads: list[Tensor]) -> bool:
+        """Whether the native kernel knows the options, and the tensors."""
+        unknown = group["amsgrad"] > 0 or group["uncentered"] or group["adaptive_bias"]
+        return not unknown and updates.are_plain(*params, *grads)
 
     def _bias_correction(self, group: dict[str, Any], share: Tensor, beta1: float, beta2: float) -> Tensor:
         """Returns ``sqrt(c2) / c1`` for the corrections c1, c2 of the two moments, ``[S]``."""

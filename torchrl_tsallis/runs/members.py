@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
+from torch.distributions import Distribution
 
 from torchrl_tsallis.data.robust_scaling import RobustScaling
 from torchrl_tsallis.data.rows import take_rows
@@ -106,18 +107,12 @@ class Members:
             Squared distances of the actions from the policies' means, in the scales of good data, and the ratings,
             ``[M, N]`` each.
         """
-        device = next(self.loss.parameters()).device
         distance, rating = (torch.empty(len(self.scalings), len(data)) for _ in range(2))
         share: Tensor = self.loss.rating_module.variance_share[:, None]
-        for start in range(0, len(data), chunk_size):
-            part = slice(start, min(start + chunk_size, len(data)))
-            rows = data[part].select("observation", "action").clone()
-            scaled: Any = torch.stack([scaling(rows) for scaling in self.scalings]).to(device)  # type: ignore[arg-type]
-            with evaluating(self.loss, self.loss.actor_network):
-                dist = get_stacked_dist(self.loss.actor_network, scaled, self.loss.actor_network_params)
-                normal = diagonal_normal(dist, scaled["action"])
-                assert normal is not None  # make_policy's distribution
-                distance[:, part] = (share * squared_distance(normal)).cpu()
+        for part, scaled, dist in self._asked(data, chunk_size):
+            normal = diagonal_normal(dist, scaled["action"])
+            assert normal is not None  # make_policy's distribution
+            distance[:, part] = (share * squared_distance(normal)).cpu()
             rating[:, part] = self.loss.rating(scaled).cpu()
         return distance, rating
 
@@ -128,17 +123,22 @@ class Members:
             data: ``observation`` ``[N, O]`` and ``action`` ``[N, A]``, in their own units.
             chunk_size: rows at once.
         """
-        device = next(self.loss.parameters()).device
         out = torch.empty(len(self.scalings), *data["action"].shape)
+        for part, _, dist in self._asked(data, chunk_size):
+            for member, scaling in enumerate(self.scalings):
+                out[member, part] = scaling.unscale_action(dist.mean[member].cpu())
+        return out
+
+    def _asked(self, data: TensorDictBase, chunk_size: int) -> Iterator[tuple[slice, Any, Distribution]]:
+        """Parts of the data, as each member's scaling gives them, and what the members make of them."""
+        device = next(self.loss.parameters()).device
         for start in range(0, len(data), chunk_size):
             part = slice(start, min(start + chunk_size, len(data)))
             rows = data[part].select("observation", "action").clone()
             scaled: Any = torch.stack([scaling(rows) for scaling in self.scalings]).to(device)  # type: ignore[arg-type]
             with evaluating(self.loss, self.loss.actor_network):
                 dist = get_stacked_dist(self.loss.actor_network, scaled, self.loss.actor_network_params)
-            for member, scaling in enumerate(self.scalings):
-                out[member, part] = scaling.unscale_action(dist.mean[member].cpu())
-        return out
+            yield part, scaled, dist
 
 
 def train_members(
