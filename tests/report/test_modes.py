@@ -19,7 +19,7 @@ from torchrl_tsallis.run import modes
 def test_episodes_of_a_mode_stand_side_by_side_with_lines_between_modes():
     figure, (axes,) = new_figure(3, 3)
     pairs = np.array([[1.0, 0.0, 0.9], [0.0, 1.0, 0.1], [0.9, 0.1, 1.0]])
-    draw_together(axes, pairs, np.array([0, 1, 0]))
+    draw_together(axes, pairs, np.array([0, 1, 0]), "policies")
     shown = axes.images[0].get_array()
     assert shown.tolist() == [[1.0, 0.9, 0.0], [0.9, 1.0, 0.1], [0.0, 0.1, 1.0]]
     assert [line.get_ydata()[0] for line in axes.lines[::2]] == [1.5]
