@@ -71,8 +71,8 @@ def test_two_operators_who_flip_pages_are_recorded_searched_and_compared(run, tm
     small = ["trajectories=3", "seeds=[1]", "workers=0", "progress=false"]
     run("flip_modes", *small)
     rows = rows_of(tmp_path / "flip_modes" / "flip_modes.csv")
-    assert [row["operator"] for row in rows] == ["calm", "quick"] * 6
-    assert {row["pair"] for row in rows} == {"keep_habits", "drawn_anew"}
+    assert [row["operator"] for row in rows] == ["calm", "quick"] * 12
+    assert {row["pair"] for row in rows} == {"keep_habits", "drawn_anew"} and {row["told"] for row in rows} == {"", "2"}
     assert len({row["tremor"] for row in rows if row["pair"] == "drawn_anew"}) == 6
     assert len({row["tremor"] for row in rows if row["pair"] == "keep_habits"}) == 2
     assert all(int(row["pages"]) > 0 for row in rows)
