@@ -31,8 +31,8 @@ from torchrl_tsallis.jobs import atomic_path, run_jobs, tick
 from torchrl_tsallis.modes import adjusted_rand_index
 from torchrl_tsallis.run import modes
 
-COLUMNS = ("pair", "seed", "told", "evidence", "trajectory", "operator", "tremor", "wander", "pages", "mode", "membership",
-           "recommended")  # fmt: skip
+COLUMNS = ("pair", "seed", "told", "evidence", "trajectory", "operator", "tremor", "wander", "pages", "mode",
+           "membership", "recommended")  # fmt: skip
 
 
 def record(operators: Any, trajectories: int, seed: int, keep: bool) -> tuple[TensorDict, list[tuple[str, str, int]]]:
