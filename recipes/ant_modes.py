@@ -6,10 +6,11 @@ killed and started again; what is done is not done twice::
     python recipes/ant_modes.py
     python recipes/ant_modes.py part=[gaits] seeds=[200,201]
 
-On a GPU many cells are one program; the policies may walk elsewhere, where the same folder is::
+By mixtures of policies, into the same tables; on a GPU many cells are one program, and the policies may walk elsewhere,
+where the same folder is::
 
-    python recipes/ant_modes.py mode=train device=cuda block=15 workers=6
-    python recipes/ant_modes.py
+    python recipes/ant_modes.py by=policies mode=train device=cuda block=15 workers=6 output=outputs/ant_mixtures
+    python recipes/ant_modes.py by=policies output=outputs/ant_mixtures results=outputs/ant_modes
 
 A video of each mode's policy::
 
@@ -37,12 +38,16 @@ from omegaconf import DictConfig, OmegaConf
 
 from torchrl_tsallis.jobs import run_jobs
 
+#: Names in the tables of what modes are found by.
+METHODS = {"distributions": "modes", "policies": "mixtures"}
 #: Options that decide about a cell's result.
-SETTINGS = ("search", "threshold", "smallest", "updates", "steps", "batch_size", "data", "evaluation")
+SETTINGS = ("by", "search", "threshold", "smallest", "updates", "steps", "batch_size", "data", "evaluation")
 
 
 def wanted_of(cfg: DictConfig) -> list[Key]:
     """The cells and seeds that are asked for, each once."""
+    if cfg.by not in METHODS:
+        raise SystemExit(f"no by={cfg.by!r}: choose of {', '.join(METHODS)}")
     names = list(cfg.cells) if cfg.part is None else as_list(cfg.part)
     unknown = [name for name in names if name not in cfg.cells]
     if unknown:
@@ -52,7 +57,9 @@ def wanted_of(cfg: DictConfig) -> list[Key]:
         check_names(cfg, OmegaConf.create({"task": cfg.cells[name].task, "method": list(cfg.methods)}))
         columns = [as_list(cfg.cells[name][column]) for column in ("trio", "task", "std")]
         keys += [
-            Key("modes", task, float(std), seed, trio) for trio, task, std in product(*columns) for seed in cfg.seeds
+            Key(METHODS[cfg.by], task, float(std), seed, trio)
+            for trio, task, std in product(*columns)
+            for seed in cfg.seeds
         ]
     return list(dict.fromkeys(keys))
 

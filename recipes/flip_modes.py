@@ -31,17 +31,25 @@ from torchrl_tsallis.jobs import atomic_path, run_jobs, tick
 from torchrl_tsallis.modes import adjusted_rand_index
 from torchrl_tsallis.run import modes
 
-COLUMNS = ("pair", "seed", "agreement", "trajectory", "operator", "tremor", "wander", "pages", "mode", "membership",
-           "recommended")  # fmt: skip
+COLUMNS = ("pair", "seed", "told", "evidence", "trajectory", "operator", "tremor", "wander", "pages", "mode",
+           "membership", "recommended")  # fmt: skip
 
 
-def record(operators: Any, trajectories: int, seed: int) -> tuple[TensorDict, list[tuple[str, str, int]]]:
-    """Both operators in turns, ``[2 n 500]``, with who it was under ``operator``; tremor, wander and pages of each."""
+def record(operators: Any, trajectories: int, seed: int, keep: bool) -> tuple[TensorDict, list[tuple[str, str, int]]]:
+    """Both operators in turns, ``[2 n 500]``, with who it was under ``operator``; tremor, wander and pages of each.
+
+    Args:
+        operators: habits that are set, by operator.
+        trajectories: of each operator.
+        seed: of what is drawn.
+        keep: whether an operator's other habits are drawn once, or anew for each trajectory.
+    """
     parts, habits = [], []
+    own = [draw_style(np.random.default_rng([seed, who, 2])) for who in range(len(operators))]
     for episode in range(trajectories * len(operators)):
         who = episode % len(operators)
         number = 100_000 * (seed + 1) + episode
-        drawn = draw_style(np.random.default_rng([number, 1]))
+        drawn = own[who] if keep else draw_style(np.random.default_rng([number, 1]))
         style = replace(drawn, **list(operators.values())[who])
         data, facts = record_flips(make_page_flip, seed=number, style=style)
         rows = data.select("observation", "action", "is_init", "next")
@@ -57,19 +65,21 @@ def search(job: tuple[str, int], cfg: DictConfig) -> None:
     pair, seed = job
     file = Path(cfg.output) / f"{pair}_{seed}.csv"
     if not file.exists():
-        operators = cfg.pairs[pair]
-        data, habits = record(operators, cfg.trajectories, seed)
+        operators = cfg.pairs[pair].operators
+        data, habits = record(operators, cfg.trajectories, seed, cfg.pairs[pair].keep)
         path = Path(cfg.output) / f"{pair}_{seed}.safetensors"
         save_demonstrations(path, data, {"pages": [pages for *_, pages in habits]})
-        folder = Path(cfg.output) / f"{pair}_{seed}"
-        found = modes(path, folder, labels="operator", seed=seed, progress=False, overwrite=True, **cfg.search)
-        known = [line.rpartition(",")[2] for line in (folder / "labels.csv").read_text().splitlines()[1:]]
         names, text = list(operators), io.StringIO()
         writer = csv.writer(text, lineterminator="\n")
-        for k, (who, mode) in enumerate(zip(known, found.mode.tolist(), strict=True)):
-            best = int(mode == found.summary["recommended"])
-            facts = [f"{found.summary['agreement']:.4f}", k, names[int(who)], *habits[k], mode]
-            writer.writerow([pair, seed, *facts, f"{found.membership[k]:.4f}", best])
+        for told in ("", len(operators)):  # how many there are
+            folder = Path(cfg.output) / (f"{pair}_{seed}_told" if told else f"{pair}_{seed}")
+            asked = {**cfg.search, "components": told} if told else cfg.search
+            found = modes(path, folder, labels="operator", seed=seed, progress=False, overwrite=True, **asked)
+            known = [line.rpartition(",")[2] for line in (folder / "labels.csv").read_text().splitlines()[1:]]
+            for k, (who, mode) in enumerate(zip(known, found.mode.tolist(), strict=True)):
+                best = int(mode == found.summary["recommended"])
+                facts = [f"{found.summary['evidence']:.4f}", k, names[int(who)], *habits[k], mode]
+                writer.writerow([pair, seed, told, *facts, f"{found.membership[k]:.4f}", best])
         with atomic_path(file) as temporary:
             temporary.write_text(text.getvalue(), encoding="utf-8")
     tick()
@@ -87,17 +97,17 @@ def report(results: Path) -> str:
     """The table of a raw file, a line a seed."""
     with open(results / "flip_modes.csv", newline="", encoding="utf-8") as file:
         rows: list[dict[str, Any]] = list(csv.DictReader(file))
-    names_of = ("operators differ in", "seed", "agreement", "modes", "Rand index", "tremor", "wander")
+    names_of = ("operators", "seed", "told how many", "evidence", "modes", "Rand index", "tremor", "wander")
     lines = [f"| {' | '.join(names_of)} |", f"|{'---|' * len(names_of)}"]
-    for pair, seed in dict.fromkeys((row["pair"], row["seed"]) for row in rows):
-        own = [row for row in rows if (row["pair"], row["seed"]) == (pair, seed)]
+    for case in dict.fromkeys((row["pair"], row["seed"], row["told"]) for row in rows):
+        own = [row for row in rows if (row["pair"], row["seed"], row["told"]) == case]
         names, mode = sorted({row["operator"] for row in own}), torch.tensor([int(row["mode"]) for row in own])
         who = torch.tensor([names.index(row["operator"]) for row in own])
         groups = []
         for k in mode.unique().tolist():
             counts = {name: int((who[mode == k] == i).sum()) for i, name in enumerate(names)}
             groups.append(", ".join(f"{count} {name}" for name, count in counts.items() if count))
-        line = [pair, seed, own[0]["agreement"], " / ".join(groups), f"{adjusted_rand_index(mode, who):.2f}"]
+        line = [*case, own[0]["evidence"], " / ".join(groups), f"{adjusted_rand_index(mode, who):.2f}"]
         line += [f"{explained([float(row[name]) for row in own], mode.numpy()):.2f}" for name in ("tremor", "wander")]
         lines.append(f"| {' | '.join(line)} |")
     text = "\n".join(lines)

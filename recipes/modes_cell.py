@@ -18,7 +18,7 @@ from torchrl_tsallis.data.robust_scaling import RobustScaling
 from torchrl_tsallis.envs import make_ant
 from torchrl_tsallis.evaluation import evaluate_policies, record_rollout
 from torchrl_tsallis.jobs import atomic_path, tick
-from torchrl_tsallis.modes import Modes, find_modes_of_each
+from torchrl_tsallis.modes import Modes, find_modes, find_modes_of_each
 from torchrl_tsallis.runs.members import Split, train_members
 from torchrl_tsallis.runs.policies import ScaledMeanPolicy
 from torchrl_tsallis.runs.saved import load_tensors, save_tensors
@@ -48,21 +48,26 @@ def write(path: Path, answer: dict[str, Any]) -> None:
 def search(keys: tuple[Key, ...], cfg: DictConfig) -> None:
     """Finds what the starts agree on in some cells, as one program, in a process of its own."""
     quiet()
-    keys = tuple(key for key in keys if not file_of(key, "starts", cfg).exists())
+    keys = tuple(key for key in keys if not file_of(key, "modes", cfg).exists())
     sets = [data_of(key, cfg) for key in keys]
-    options = {"updates": cfg.updates, "batch_size": cfg.batch_size, "device": cfg.device}
-    each = find_modes_of_each(sets, seeds=[key.seed for key in keys], **cfg.search, **options) if keys else []
+    if cfg.by == "policies":
+        options = {"updates": cfg.updates, "batch_size": cfg.batch_size, "device": cfg.device, **cfg.search}
+        options |= {"threshold": cfg.threshold, "seeds": [key.seed for key in keys]}
+        each = find_modes_of_each(sets, **options) if keys else []
+    else:
+        each = [find_modes(rows, threshold=cfg.threshold) for rows in sets]
     for key, found, rows in zip(keys, each, sets, strict=True):
-        answer = {"pairs": found.pairs.tolist(), "starts": found.starts.tolist()}
-        write(file_of(key, "starts", cfg), answer | {"expert": rows["expert"][find_episodes(rows).starts].tolist()})
+        answer = {**vars(found), "pairs": found.pairs.tolist(), "membership": found.membership.tolist()}
+        write(file_of(key, "modes", cfg), answer | {"expert": rows["expert"][find_episodes(rows).starts].tolist()})
     tick()
 
 
 def found_in(key: Key, cfg: DictConfig) -> tuple[Modes, list[int]]:
     """The modes of a cell, and the demonstrator of each episode."""
-    answer = json.loads(file_of(key, "starts", cfg).read_text())
-    pairs, starts = torch.tensor(answer["pairs"], dtype=torch.float64), torch.tensor(answer["starts"])
-    return Modes.of(pairs, starts, threshold=cfg.threshold), answer["expert"]
+    answer = json.loads(file_of(key, "modes", cfg).read_text())
+    expert, groups = answer.pop("expert"), tuple(map(tuple, answer.pop("groups")))
+    numbers = {name: torch.tensor(answer.pop(name), dtype=torch.float64) for name in ("pairs", "membership")}
+    return Modes(groups, **numbers, **answer), expert
 
 
 def train(keys: tuple[Key, ...], cfg: DictConfig) -> None:
@@ -124,7 +129,7 @@ def film(key: Key, cfg: DictConfig) -> None:
     """A video of each mode's policy, in a process of its own."""
     quiet()
     for mode, policy in policies_of(key, cfg).items():
-        place = Path(cfg.results).absolute() / f"modes_{key.trio}_{key.task}_{key.std:g}_{key.seed}_{mode}.gif"
+        place = Path(cfg.results).absolute() / f"{key.method}_{key.trio}_{key.task}_{key.std:g}_{key.seed}_{mode}.gif"
         options = {"seconds": cfg.film_seconds, "seed": cfg.evaluation.seed, "step_seconds": 0.0165}
         record_rollout(policy, place, env_fn=make_ant, size=(240, 180), **options)
     tick()
@@ -133,10 +138,8 @@ def film(key: Key, cfg: DictConfig) -> None:
 def answer_of(key: Key, cfg: DictConfig) -> dict[str, Any]:
     """All that was found of a cell."""
     found, expert = found_in(key, cfg)
-    modes = found.of_episodes
-    member = found.membership[modes, torch.arange(len(modes))]
-    answer = {"agreement": found.agreement, "recommended": found.recommended, "mode": modes.tolist()}
-    answer |= {"membership": member.tolist(), "expert": expert}
+    answer = {"evidence": found.evidence, "recommended": found.recommended, "mode": found.of_episodes.tolist()}
+    answer |= {"membership": found.membership.tolist(), "expert": expert}
     return answer | {"returns": json.loads(file_of(key, "returns", cfg).read_text())}
 
 
@@ -149,5 +152,5 @@ def data_of(key: Key, cfg: DictConfig) -> Any:
 
 def file_of(key: Key, what: str, cfg: DictConfig, ending: str = "json") -> Path:
     """Where what was found of a cell, or the returns, are kept."""
-    folder = Path(cfg.output).absolute() / "cells" / key.trio / f"std_{key.std:g}" / key.task
+    folder = Path(cfg.output).absolute() / "cells" / key.method / key.trio / f"std_{key.std:g}" / key.task
     return folder / f"{what}_{key.seed}.{ending}"

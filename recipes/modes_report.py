@@ -19,34 +19,38 @@ from torchrl_tsallis.jobs import atomic_path
 from torchrl_tsallis.modes import adjusted_rand_index
 
 RETURNS = ("method", "trio", "task", "std", "seed", "component", "share", "recommended", "episode", "return")
-ASSIGNED = ("trio", "task", "std", "seed", "agreement", "episode", "demonstrator", "mode",
+ASSIGNED = ("method", "trio", "task", "std", "seed", "evidence", "episode", "demonstrator", "mode",
             "membership")  # fmt: skip
+#: What modes were found by.
+METHODS = {"modes": "distributions", "mixtures": "policies"}
+FILES = {"modes.csv": RETURNS, "modes_assignments.csv": ASSIGNED}
 #: Policies of all demonstrations that the modes' are compared with.
 OTHERS = {"bc": "BC", "proposal": "proposal", "peak": "peak, tuned"}
 Rows = list[dict[str, Any]]
 
 
 def write_rows(folder: Path, answers: Mapping[Key, Mapping[str, Any]]) -> None:
-    """Writes ``modes.csv`` and ``modes_assignments.csv``, atomically."""
+    """Writes ``modes.csv`` and ``modes_assignments.csv``, atomically; rows of another method stay."""
     returns, assigned = [], []
     for key, answer in answers.items():
-        cell = {"trio": key.trio, "task": key.task, "std": f"{key.std:g}", "seed": key.seed}
+        cell = {"method": key.method, "trio": key.trio, "task": key.task, "std": f"{key.std:g}", "seed": key.seed}
         modes = answer["mode"]
         for component, values in answer["returns"].items():
             share = sum(mode == int(component) for mode in modes) / len(modes)
             about = {"component": component, "share": f"{share:.4f}"}
             about["recommended"] = int(int(component) == answer["recommended"])
-            rows = [{"episode": k, "return": f"{value:.3f}"} for k, value in enumerate(values)]
-            returns += [{"method": "modes", **cell, **about, **row} for row in rows]
+            returns += [{**cell, **about, "episode": k, "return": f"{value:.3f}"} for k, value in enumerate(values)]
         per_episode = zip(modes, answer["expert"], answer["membership"], strict=True)
         for episode, (mode, who, share) in enumerate(per_episode):
-            line = {"agreement": f"{answer['agreement']:.4f}", "episode": episode, "demonstrator": who, "mode": mode}
+            line = {"evidence": f"{answer['evidence']:.4f}", "episode": episode, "demonstrator": who, "mode": mode}
             assigned.append({**cell, **line, "membership": f"{share:.4f}"})
-    for name, columns, rows in (("modes.csv", RETURNS, returns), ("modes_assignments.csv", ASSIGNED, assigned)):
+    methods = {key.method for key in answers}
+    old = read_rows(folder) if all((folder / name).exists() for name in FILES) else ([], [])
+    for name, rows, before in zip(FILES, (returns, assigned), old, strict=True):
         text = io.StringIO()
-        writer = csv.DictWriter(text, columns, lineterminator="\n")
+        writer = csv.DictWriter(text, FILES[name], lineterminator="\n")
         writer.writeheader()
-        writer.writerows(rows)
+        writer.writerows(rows + [row for row in before if row["method"] not in methods])
         with atomic_path(folder / name) as path:
             path.write_text(text.getvalue(), encoding="utf-8")
 
@@ -54,7 +58,7 @@ def write_rows(folder: Path, answers: Mapping[Key, Mapping[str, Any]]) -> None:
 def read_rows(folder: Path) -> tuple[Rows, Rows]:
     """Reads what :func:`write_rows` wrote."""
     found = []
-    for name in ("modes.csv", "modes_assignments.csv"):
+    for name in FILES:
         if not (folder / name).exists():
             raise SystemExit(f"there is no {folder / name}: run with mode=run first, or name the folder by results=...")
         with open(folder / name, newline="", encoding="utf-8") as file:
@@ -62,11 +66,11 @@ def read_rows(folder: Path) -> tuple[Rows, Rows]:
     return found[0], found[1]
 
 
-def by_cell(rows: Sequence[Mapping[str, Any]]) -> dict[tuple[str, str, float], dict[int, Rows]]:
-    """Rows by cell and seed."""
-    out: dict[tuple[str, str, float], dict[int, Rows]] = {}
+def by_cell(rows: Sequence[Mapping[str, Any]]) -> dict[tuple[str, str, float, str], dict[int, Rows]]:
+    """Rows by cell and seed; a cell is trio, task, noise and method."""
+    out: dict[tuple[str, str, float, str], dict[int, Rows]] = {}
     for row in rows:
-        cell = out.setdefault((row["trio"], row["task"], float(row["std"])), {})
+        cell = out.setdefault((row["trio"], row["task"], float(row["std"]), row["method"]), {})
         cell.setdefault(int(row["seed"]), []).append(dict(row))
     return out
 
@@ -113,11 +117,19 @@ def report(returns: Rows, assigned: Rows, folder: Path, *, known: Path) -> str:
     """Writes ``modes.md`` and ``modes.png``; returns the text."""
     others = read_raw(known) if known.exists() else []
     found, table, cells = by_cell(assigned), [], {}
-    for (trio, task, std), seeds in sorted(by_cell(returns).items()):
+    walked = by_cell(returns)
+    for trio, task, std, method in sorted(walked, key=lambda cell: (*cell[:3], list(METHODS).index(cell[3]))):
+        seeds = walked[trio, task, std, method]
         own = [r for r in others if (r["trio"], r["task"], r["std"], r["scale"]) == (trio, task, std, 1.0)]
-        cells[trio, task, std] = values = values_of(seeds, own)
-        line = {"trio": trio, "task": task, "std": f"{std:g}"} | agreement_of(found[trio, task, std])
+        values = values_of(seeds, own)
+        shown = cells.setdefault((trio, task, std), values if method == "modes" else {})
+        if method == "mixtures":
+            shown["recommended, by policies"] = values["recommended mode"]
+            values = {name: value for name, value in values.items() if name not in OTHERS.values()}
+        line = {"trio": trio, "task": task, "std": f"{std:g}", "by": METHODS[method]}
+        line |= agreement_of(found[trio, task, std, method])
         table.append(line | {name: each(numbers) for name, numbers in values.items()})
+    table = [{name: line.get(name, "") for name in table[0]} for line in table]
     text = (
         f"Median over seeds (value of each seed); returns are medians of a policy's episodes:\n\n{as_markdown(table)}"
     )

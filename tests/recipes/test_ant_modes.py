@@ -13,7 +13,8 @@ for package in ("hydra", "pybullet", "matplotlib", "tqdm"):
 
 RECIPES = Path(__file__).parents[2] / "recipes"
 SMALL = ["data.length=40", "updates=1", "steps=10", "evaluation.episodes=1", "search.starts=2", "search.components=2",
-         "part=[gaits]", "cells.gaits.std=0.2", "seeds=[1,2]", "workers=0", "progress=false"]  # fmt: skip
+         "by=policies", "part=[gaits]", "cells.gaits.std=0.2",
+          "seeds=[1,2]", "workers=0", "progress=false"]  # fmt: skip
 
 
 @pytest.fixture
@@ -38,13 +39,13 @@ def rows_of(path):
 def test_cells_that_were_searched_elsewhere_walk_here_and_nothing_is_done_twice(run, tmp_path):
     cache = f"data.cache={tmp_path / 'data'}"
     run("ant_modes", *SMALL, cache, "mode=train", "block=2")
-    cells = tmp_path / "ant_modes" / "cells" / "other_gait" / "std_0.2" / "both"
+    cells = tmp_path / "ant_modes" / "cells" / "mixtures" / "other_gait" / "std_0.2" / "both"
     before = {path.name: path.stat().st_mtime_ns for path in cells.iterdir()}
-    assert sorted(name.partition(".")[0] for name in before) == ["policies_1", "policies_2", "starts_1", "starts_2"]
+    assert sorted(name.partition(".")[0] for name in before) == ["modes_1", "modes_2", "policies_1", "policies_2"]
     run("ant_modes", *SMALL, cache)
     assert {name: (cells / name).stat().st_mtime_ns for name in before} == before, "done twice"
     returns, assigned = (rows_of(tmp_path / "ant_modes" / f"{name}.csv") for name in ("modes", "modes_assignments"))
-    assert {row["seed"] for row in returns} == {"1", "2"} and {row["method"] for row in returns} == {"modes"}
+    assert {row["seed"] for row in returns} == {"1", "2"} and {row["method"] for row in returns} == {"mixtures"}
     assert [sum(row["seed"] == seed for row in assigned) for seed in ("1", "2")] == [30, 30]
     assert {row["demonstrator"] for row in assigned} == {"0", "1", "2", "3"}
     for seed in ("1", "2"):
@@ -67,11 +68,13 @@ def test_a_mode_or_part_that_there_is_not_is_refused_before_anything_is_made(run
 
 
 def test_two_operators_who_flip_pages_are_recorded_searched_and_compared(run, tmp_path, capsys):
-    small = ["trajectories=3", "seeds=[1]", "search.updates=1", "search.starts=2", "workers=0", "progress=false"]
+    small = ["trajectories=3", "seeds=[1]", "workers=0", "progress=false"]
     run("flip_modes", *small)
     rows = rows_of(tmp_path / "flip_modes" / "flip_modes.csv")
-    assert [row["operator"] for row in rows] == ["calm", "quick"] * 3
-    assert {row["pair"] for row in rows} == {"speed_and_height"} and len({row["tremor"] for row in rows}) == 6
+    assert [row["operator"] for row in rows] == ["calm", "quick"] * 12
+    assert {row["pair"] for row in rows} == {"keep_habits", "drawn_anew"} and {row["told"] for row in rows} == {"", "2"}
+    assert len({row["tremor"] for row in rows if row["pair"] == "drawn_anew"}) == 6
+    assert len({row["tremor"] for row in rows if row["pair"] == "keep_habits"}) == 2
     assert all(int(row["pages"]) > 0 for row in rows)
     assert "calm" in (tmp_path / "flip_modes" / "flip_modes.md").read_text()
     assert "Rand index" in capsys.readouterr().out

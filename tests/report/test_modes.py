@@ -19,7 +19,7 @@ from torchrl_tsallis.run import modes
 def test_episodes_of_a_mode_stand_side_by_side_with_lines_between_modes():
     figure, (axes,) = new_figure(3, 3)
     pairs = np.array([[1.0, 0.0, 0.9], [0.0, 1.0, 0.1], [0.9, 0.1, 1.0]])
-    draw_together(axes, pairs, np.array([0, 1, 0]))
+    draw_together(axes, pairs, np.array([0, 1, 0]), "policies")
     shown = axes.images[0].get_array()
     assert shown.tolist() == [[1.0, 0.9, 0.0], [0.9, 1.0, 0.1], [0.0, 0.1, 1.0]]
     assert [line.get_ydata()[0] for line in axes.lines[::2]] == [1.5]
@@ -48,9 +48,14 @@ def test_a_map_of_differences_has_time_from_left_to_right_and_a_row_a_dimension(
     )
 
 
-def searched(folder, **options):
-    rows = {"observation": torch.rand(80, 2), "action": torch.rand(80, 1), "episode": torch.arange(80) // 10}
-    data = TensorDict({**rows, "operator": rows["episode"] % 2}, [80])
+def searched(folder, apart=1, **options):
+    episode = torch.arange(80) // 10
+    rows = {
+        "observation": torch.rand(80, 2) + apart * (episode % 2)[:, None],
+        "action": torch.rand(80, 1),
+        "episode": episode,
+    }
+    data = TensorDict({**rows, "operator": episode % 2}, [80])
     return modes(data, folder, updates=2, progress=False, overwrite=True, **options)
 
 
@@ -78,7 +83,7 @@ def test_a_folder_with_its_page_may_be_replaced_and_one_with_more_may_not(tmp_pa
 
 
 def test_the_page_of_one_mode_compares_nothing(tmp_path):
-    searched(tmp_path / "modes")
+    searched(tmp_path / "modes", apart=0)
     text = write_modes_report(tmp_path / "modes").read_text()
     assert "<h1>One mode of behaviour</h1>" in text
     assert "How they differ" not in text and "Your labels" not in text and "(imitate)" not in text

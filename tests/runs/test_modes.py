@@ -29,7 +29,7 @@ def file(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def folder(file):
-    modes(file, file.parent / "modes", components=3, updates=40, batch_size=32, progress=False)
+    modes(file, file.parent / "modes", by="policies", components=3, updates=40, batch_size=32, progress=False)
     return file.parent / "modes"
 
 
@@ -126,7 +126,7 @@ def arrays():
 def test_labels_of_the_user_are_compared_and_not_used(tmp_path, ending):
     path, who = tmp_path / f"data.{ending}", np.array(["anna", "ben"] * 6)
     LABELLED[ending](path, who)
-    options = {"updates": 1, "components": 2, "progress": False}
+    options = {"updates": 1, "components": 2, "by": "policies", "progress": False}
     with_labels = modes(path, tmp_path / "with", labels="operator", **options)
     without = modes(path, tmp_path / "without", **options)
     assert (with_labels.mode == without.mode).all() and "labels" not in without.summary
@@ -161,17 +161,51 @@ def test_data_that_have_changed_since_are_refused(file, folder, tmp_path):
         ModesFolder.open(copy)
 
 
-def described(groups, pairs, starts):
+def described(pairs, starts, **options):
     pairs = torch.tensor(pairs, dtype=torch.float64)
-    return describe(Modes(groups, pairs, torch.tensor(starts)), [10] * len(pairs))
+    return describe(Modes.of_starts(pairs, torch.tensor(starts), **options), [10] * len(pairs))
 
 
 def test_a_recommendation_says_how_sure_it_is():
     pairs = [[1.0, 1.0, 1.0, 0.0], [1.0, 1.0, 1.0, 0.0], [1.0, 1.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
-    sure = described(((0, 1, 2), (3,)), pairs, [[0, 0, 0, 1]] * 2)
+    sure = described(pairs, [[0, 0, 0, 1]] * 2)
     assert sure["sure"] and sure["recommended"] == 0 and sure["sentence"].endswith("Imitate mode 0.")
     half = [[1.0, 0.6, 0.0, 0.0], [0.6, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.5], [0.0, 0.0, 0.5, 1.0]]
-    found = described(((0, 1), (2, 3)), half, [[0, 0, 1, 1], [0, 1, 0, 1]])
+    found = described(half, [[0, 0, 1, 1], [0, 1, 0, 1]], always=True)
     assert found["recommended"] == 0 and len(found["reasons"]) == 3 and "with care" in found["sentence"]
-    one = described(((0, 1, 2, 3),), half, [[0, 0, 1, 1], [0, 1, 0, 1]])
+    one = described(half, [[0, 0, 1, 1], [0, 1, 0, 1]])
     assert one["sure"] and one["recommended"] == 0 and one["sentence"].startswith("One mode")
+
+
+def test_what_is_said_of_modes_that_lie_apart():
+    def said(*places, **options):
+        place = torch.tensor(places).double()
+        distances = (place[:, None] - place).abs()
+        return describe(Modes.of_distances(distances, **options), [10] * len(places))
+
+    sure = said(0, 1, 2, 3, 100, 101)
+    assert sure["sure"] and sure["by"] == "distributions" and sure["sentence"].endswith("Imitate mode 0.")
+    equal = said(0, 1, 2, 100, 101, 102)
+    assert equal["reasons"] == ["another mode is about as large"] and "with care" in equal["sentence"]
+    forced = said(0, 1, 2, 3, 4, 5, 6, least=0.9, count=3)
+    assert any(reason.startswith("its episodes are hardly nearer") for reason in forced["reasons"])
+    one = said(0, 1, 2, 3, 4, 5, 6, least=0.9)
+    assert one["sure"] and one["sentence"].startswith("One mode: no episodes lie apart from the others (0.")
+
+
+def test_operators_who_are_elsewhere_are_found_from_the_command_line(tmp_path, capsys):
+    from torchrl_tsallis.cli import main
+
+    rng, where = np.random.default_rng(0), np.repeat(np.arange(8) % 2, 30)[:, None]
+    path = tmp_path / "data.npz"
+    observations = where + 0.1 * rng.normal(size=(240, 2))
+    np.savez(path, observations=observations, actions=-where + 0.1 * rng.normal(size=(240, 1)),
+             terminals=np.arange(240) % 30 == 29, operator=where[:, 0])  # fmt: skip
+    words = ["modes", str(path), "--out", str(tmp_path / "out"), "--labels", "operator", "--train.updates", "1"]
+    with pytest.raises(SystemExit) as stopped:
+        main(words)
+    assert stopped.value.code == 0
+    assert "2 modes of more than one episode" in capsys.readouterr().out
+    found = ModesFolder.open(tmp_path / "out")
+    assert found.mode.tolist() == [0, 1] * 4 and found.summary["labels"]["rand_index"] == 1.0
+    assert (tmp_path / "out" / "modes.html").read_text().count("lies apart") == 0

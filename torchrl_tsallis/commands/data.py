@@ -130,14 +130,17 @@ class Modes(Reads):
         out: folder to write.
         labels: key of what is known of each episode, such as its operator, which what was found is compared with; mask
             for the filter keys of robomimic. It is never used in the search.
-        components: auto, or a number: then modes are looked for although one may be enough.
-        train: of the mixtures.
+        by: what modes are found by: distributions of what happens in an episode (seconds), or policies, mixtures of
+            which are trained (minutes); these see operators who do other things in the same situations.
+        components: auto, or a number of modes, whether they lie apart or not; by policies of a mixture's components.
+        train: of the mixtures, and of the policies that show how modes differ.
         device: of the policies, such as cuda.
         overwrite: whether an earlier run in the folder is replaced.
     """
 
     out: Path = Path("modes")
     labels: str | None = None
+    by: Literal["distributions", "policies"] = "distributions"
     components: Literal["auto"] | int = "auto"
     train: ModesTraining = field(default_factory=ModesTraining)
     device: str = "cpu"
@@ -153,6 +156,7 @@ class Modes(Reads):
             **self.chosen(),
             **vars(self.train),
             labels=self.labels,
+            by=self.by,
             components=None if self.components == "auto" else self.components,
             device=self.device,
             overwrite=self.overwrite,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import torch
 from torch import Tensor
@@ -60,23 +60,38 @@ def consensus(pairs: Tensor, threshold: float = 0.5) -> list[list[int]]:
         [[0, 2], [1], [3]]
     """
     check_number("threshold", threshold, above=0, high=1)
+    *_, last = average_linkage(pairs, threshold)
+    return sorted((sorted(group) for group in last), key=lambda group: (-len(group), group[0]))
+
+
+def average_linkage(pairs: Tensor, threshold: float = -torch.inf) -> Iterator[list[list[int]]]:
+    """Groups after each merge of the two that are closest, on average over their pairs, from each one alone to one.
+
+    Args:
+        pairs: how close two of them are, ``[E, E]``.
+        threshold: two groups that are less close are not merged.
+
+    Yields:
+        The groups, the same list each time.
+    """
     groups = [[i] for i in range(len(pairs))]
     sums = pairs.double().clone()  # over the pairs of two groups
     sizes = torch.ones(len(pairs), dtype=torch.float64)
+    yield groups
     while len(groups) > 1:
         means = sums / sizes[:, None] / sizes[None]
-        means.fill_diagonal_(-1.0)
+        means.fill_diagonal_(-torch.inf)
         best = int(means.argmax())
         first, second = sorted(divmod(best, len(groups)))
         if means.view(-1)[best] < threshold:
-            break
+            return
         groups[first] += groups.pop(second)
         keep = torch.arange(len(sizes)) != second
         sums[first] += sums[second]
         sums[:, first] += sums[:, second]
         sizes[first] += sizes[second]
         sums, sizes = sums[keep][:, keep], sizes[keep]
-    return sorted((sorted(group) for group in groups), key=lambda group: (-len(group), group[0]))
+        yield groups
 
 
 def adjusted_rand_index(first: Tensor, second: Tensor) -> float:

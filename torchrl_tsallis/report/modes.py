@@ -11,6 +11,8 @@ from torchrl_tsallis.report.svg import MUTED
 #: Colours of the largest modes that can be told apart without seeing red and green; all others are grey.
 COLOURS = ("#0072b2", "#e69f00", "#009e73", "#cc79a7", "#56b4e9", "#d55e00", "#f0e442")
 
+TITLES = {"policies": "how often together, over starts", "distributions": "how alike episodes are, from 0 to 1"}
+
 
 def colour_of(mode: int, episodes: int) -> str:
     """Colour of a mode: grey for an episode alone, and for modes after the seventh.
@@ -22,20 +24,21 @@ def colour_of(mode: int, episodes: int) -> str:
     return COLOURS[mode] if episodes > 1 and mode < len(COLOURS) else MUTED
 
 
-def draw_together(axes: Any, pairs: np.ndarray, mode: np.ndarray) -> None:
-    """How often two episodes are of one component, with the episodes of a mode side by side.
+def draw_together(axes: Any, pairs: np.ndarray, mode: np.ndarray, by: str) -> None:
+    """How close two episodes are, with the episodes of a mode side by side.
 
     Args:
         axes: to draw on.
         pairs: ``[E, E]``, in [0, 1].
         mode: of each episode, ``[E]``.
+        by: what modes were found by.
     """
     order = np.argsort(mode, kind="stable")
     image = axes.imshow(pairs[order][:, order], cmap="Blues", vmin=0, vmax=1, interpolation="none")
     for edge in np.flatnonzero(np.diff(mode[order])) + 0.5:
         axes.axhline(edge, color=MUTED, linewidth=0.5)
         axes.axvline(edge, color=MUTED, linewidth=0.5)
-    axes.set(xlabel="episode, by mode", ylabel="episode, by mode", title="how often together, over starts")
+    axes.set(xlabel="episode, by mode", ylabel="episode, by mode", title=TITLES[by])
     axes.figure.colorbar(image, ax=axes, shrink=0.8)
 
 

@@ -51,7 +51,7 @@ def write_modes_report(folder: str | os.PathLike[str]) -> Path:
     pairs = load_tensors(found.path / "pairs.safetensors")["pairs"].numpy()
     text = _render(found, pairs, os.fspath(folder))
     figure, (left, right) = new_figure(10, 4, columns=2)
-    draw_together(left, pairs, found.mode)
+    draw_together(left, pairs, found.mode, found.summary["by"])
     draw_modes(right, found.mode, found.membership)
     with atomic_path(found.path / PICTURE) as path:
         figure.savefig(path, format="png", facecolor="white")
@@ -108,9 +108,8 @@ def _render(found: ModesFolder, pairs: np.ndarray, folder: str) -> str:
         9.6,
         2.6,
     )
-    together = Panel(
-        partial(draw_together, pairs=pairs, mode=found.mode), "How often each two episodes were together", 5, 4
-    )
+    close = partial(draw_together, pairs=pairs, mode=found.mode, by=found.summary["by"])
+    together = Panel(close, "How close each two episodes are", 5, 4)
     differing = []
     for (a, b), apart in list(read_differences(found).items())[:MOST_PAIRS]:
         colours = (colour_of(a, 2), colour_of(b, 2))

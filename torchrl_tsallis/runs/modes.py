@@ -6,7 +6,7 @@ import os
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from itertools import combinations
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from tensordict import TensorDictBase
@@ -17,7 +17,8 @@ from torchrl_tsallis._device import check_device
 from torchrl_tsallis.data.modes_folder import KIND, ModesFolder
 from torchrl_tsallis.data.rows import take_rows
 from torchrl_tsallis.modes.find import UPDATES, find_modes
-from torchrl_tsallis.modes.found import AGREE, Modes
+from torchrl_tsallis.modes.found import AGREE, By, Modes
+from torchrl_tsallis.modes.separation import SEPARATED, SURE
 from torchrl_tsallis.modes.train import BETA, LR, steps_between
 from torchrl_tsallis.runs.differences import mode_differences
 from torchrl_tsallis.runs.folder import FORMAT, RUN, check_free, new_folder, write_csv, write_json
@@ -25,11 +26,51 @@ from torchrl_tsallis.runs.labels import compare_labels, read_labels
 from torchrl_tsallis.runs.saved import save_tensors, versions
 from torchrl_tsallis.runs.source import Source, identity, load_source
 
-#: Certainty of a mode, and how much larger than the next one it has to be, for a recommendation that is sure.
-CERTAIN, LARGER = 0.8, 1.25
+#: How much larger than the next one a mode has to be for a recommendation that is sure.
+LARGER = 1.25
 MODES = ("episode", "source", "steps", "mode", "membership")
 LABELS = ("episode", "source", "label")
 DIFFERENCES = ("mode", "other", "part", "action", "difference")
+
+
+class Words(NamedTuple):
+    """What is said of modes, by what they were found by.
+
+    Attributes:
+        certain: least certainty of a mode that is recommended without care.
+        sure: least evidence for that.
+        least: evidence for more than one mode.
+        one: why there is one mode.
+        doubt: what is said of less certainty.
+        hardly: what is said of less evidence.
+    """
+
+    certain: float
+    sure: float
+    least: float
+    one: str
+    doubt: str
+    hardly: str
+
+
+WORDS = {
+    "distributions": Words(
+        SEPARATED,
+        SURE,
+        SEPARATED,
+        "no episodes lie apart from the others",
+        "its episodes are hardly nearer to one another than to others ({:.2f}; 1 is most)",
+        f"one habit that varies without a gap can look like this too (up to {SURE:g})",
+    ),
+    "policies": Words(
+        0.8,
+        AGREE,
+        AGREE,
+        "the starts do not agree on several",
+        "the starts agree on it by {:.2f} only (1 is always)",
+        "the starts hardly agree on anything, as where there is one mode",
+    ),
+}
 
 
 def modes(
@@ -42,6 +83,7 @@ def modes(
     format: str | None = None,
     filter_key: str | None = None,
     labels: str | None = None,
+    by: By = "distributions",
     components: int | None = None,
     starts: int = 4,
     updates: int = UPDATES,
@@ -64,8 +106,10 @@ def modes(
         filter_key: subset of the file's episodes.
         labels: key of what is known of each episode, such as its operator, which what was found is compared with;
             ``mask`` for the filter keys of robomimic. It is never used in the search. Default: none.
-        components: of each mixture. Default: 6, and one mode where that is enough.
-        starts: of mixtures.
+        by: what modes are found by: ``distributions`` of what happens in an episode, or ``policies``, mixtures of them.
+        components: by distributions the number of modes, whether they lie apart or not; by policies the components of a
+            mixture, and modes are looked for although one may be enough. Default: as many modes as there are.
+        starts: of mixtures; by policies, as are the next two.
         updates: of the responsibilities, an epoch between two.
         batch_size: samples a step and component.
         seed: of starts and policies.
@@ -95,15 +139,14 @@ def modes(
     chosen = {"obs": obs, "action": action, "episode": episode, "format": format, "filter_key": filter_key}
     source = load_source(path_or_data, **chosen)  # type: ignore[arg-type]
     known = None if labels is None else read_labels(path_or_data, source, labels, {**chosen, "observation": obs})
-    numbers: dict[str, Any] = {"starts": starts, "updates": updates, "batch_size": batch_size}
-    numbers |= {"components": 6 if components is None else components, "seed": seed}
+    numbers: dict[str, Any] = {"starts": starts, "updates": updates, "batch_size": batch_size, "seed": seed}
+    numbers |= {"by": by, "components": components}
     with new_folder(out, overwrite=overwrite) as folder:
         found = find_modes(source.data, **numbers, always=components is not None, device=device, progress=progress)
         episodes = source.episodes()
         lengths = episodes.lengths.tolist()
         number = found.of_episodes
-        member = found.membership[number, torch.arange(len(number))]
-        columns = (source.names, lengths, number.tolist(), member.tolist())
+        columns = (source.names, lengths, number.tolist(), found.membership.tolist())
         write_csv(folder / "modes.csv", MODES, zip(range(len(number)), *columns, strict=True))
         save_tensors(folder / "pairs.safetensors", {"pairs": found.pairs.float()})
         summary = describe(found, lengths, components is not None)
@@ -138,7 +181,7 @@ def describe(found: Modes, lengths: Sequence[int], asked: bool = False) -> dict[
     Args:
         found: the modes.
         lengths: steps of each episode.
-        asked: whether modes were asked for, however little the starts agree.
+        asked: whether modes were asked for, however little speaks for them.
     """
     share, certainty = found.share.tolist(), found.certainty.tolist()
     listed = [
@@ -153,20 +196,18 @@ def describe(found: Modes, lengths: Sequence[int], asked: bool = False) -> dict[
     ]
     best = found.recommended
     rest = max((share[k] for k in range(len(share)) if k != best), default=0.0)
-    reasons = []
+    words, reasons = WORDS[found.by], []
     if len(found.groups) > 1:
-        if certainty[best] < CERTAIN:
-            reasons.append(f"the starts agree on it by {certainty[best]:.2f} only (1 is always)")
+        if certainty[best] < words.certain:
+            reasons.append(words.doubt.format(certainty[best]))
         if share[best] < LARGER * rest:
             reasons.append("another mode is about as large")
-        if found.agreement < AGREE:
-            reasons.append("the starts hardly agree on anything, as where there is one mode")
+        if found.evidence < words.sure:
+            reasons.append(words.hardly)
     large = [mode for mode in listed if mode["episodes"] > 1]
     alone = len(listed) - len(large)
     if len(found.groups) == 1:
-        sentence = (
-            f"One mode: the starts do not agree on several ({found.agreement:.2f}, at least {AGREE:g} is needed)."
-        )
+        sentence = f"One mode: {words.one} ({found.evidence:.2f}, at least {words.least:g} is needed)."
     else:
         text = ", ".join(f"{mode['mode']} ({mode['episodes']} episodes)" for mode in large)
         sentence = (
@@ -178,7 +219,8 @@ def describe(found: Modes, lengths: Sequence[int], asked: bool = False) -> dict[
         "recommended": best,
         "sure": not reasons,
         "reasons": reasons,
-        "agreement": found.agreement,
+        "by": found.by,
+        "evidence": found.evidence,
         "asked": asked,
         "sentence": sentence,
     }
